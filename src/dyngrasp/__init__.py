@@ -1,0 +1,1 @@
+"""Dynamic grasping with online trajectory replanning."""

@@ -1,0 +1,100 @@
+"""What flows along the arrows of the block diagram: small frozen values, SI units, one monotonic clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+    """A contiguous read-only float copy of `values`.
+
+    Args:
+        values: Anything numpy can turn into floats.
+        shape: The shape it must have; −1 matches any length.
+
+    Raises:
+        ValueError: The shape differs.
+    """
+    array = np.array(values, dtype=float, order="C")
+    if shape is not None:
+        fits = array.ndim == len(shape) and all(s in (-1, a) for s, a in zip(shape, array.shape, strict=True))
+        if not fits:
+            raise ValueError(f"expected shape {shape}, got {array.shape}")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Position (rad), velocity (rad/s) and acceleration (rad/s²) of n joints, each of shape (n,), at time `t` (s)."""
+
+    t: float
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+    def __post_init__(self) -> None:
+        for name in ("position", "velocity", "acceleration"):
+            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """Where the part is believed to be.
+
+    Attributes:
+        T_world_object: Estimated pose.
+        covariance: (6, 6), of a right perturbation `T · exp(δ)` with δ = [translation (m), rotation (rad)].
+        t_capture: When the light that this rests on was measured (s).
+        t_receipt: When the estimate became available (s).
+        twist_world: (6,), linear (m/s) and angular velocity (rad/s) of the part, world axes.
+    """
+
+    T_world_object: pin.SE3
+    covariance: Array
+    t_capture: float
+    t_receipt: float
+    twist_world: Array = field(default_factory=lambda: np.zeros(6))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", read_only(self.covariance, (6, 6)))
+        object.__setattr__(self, "twist_world", read_only(self.twist_world, (6,)))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the sensors of the plant give: no velocities, they are filtered from positions.
+
+    Attributes:
+        t: Time of the measurement (s).
+        arm_position: (n,) encoder positions (rad).
+        gripper_position: (m,) positions of the planned gripper joints (rad).
+        pad_force: (pads,) normal force on each tactile pad (N).
+    """
+
+    t: float
+    arm_position: Array
+    gripper_position: Array
+    pad_force: Array
+
+    def __post_init__(self) -> None:
+        for name in ("arm_position", "gripper_position", "pad_force"):
+            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+
+
+@dataclass(frozen=True)
+class Command:
+    """Joint torques (Nm) for the arm, shape (n,), and for the planned gripper joints, shape (m,)."""
+
+    arm_torque: Array
+    gripper_torque: Array
+
+    def __post_init__(self) -> None:
+        for name in ("arm_torque", "gripper_torque"):
+            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))

@@ -1,0 +1,254 @@
+"""Trajectories on a uniform grid, and the plan that puts three phases of arm and gripper on one timeline."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dyngrasp.errors import InvalidTrajectory, PlanFileError
+from dyngrasp.signals import Array, JointState, read_only
+
+PHASE_NAMES = ("approach", "grasp", "deliver")
+
+# A join is two roundings of the same number, so it may differ by a few ulp of 2π and no more.
+JOIN_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion ξ on N+1 equidistant grid points that satisfies the trapezoidal rule, eq. (3b).
+
+    Attributes:
+        duration: ΔT (s), > 0.
+        position: (N+1, n) in rad.
+        velocity: (N+1, n) in rad/s.
+        acceleration: (N+1, n) in rad/s².
+
+    Raises:
+        InvalidTrajectory: Shapes differ, fewer than two grid points, a non-finite number, or a duration ≤ 0.
+    """
+
+    duration: float
+    position: Array
+    velocity: Array
+    acceleration: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "duration", float(self.duration))
+        for name in ("position", "velocity", "acceleration"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        shapes = {self.position.shape, self.velocity.shape, self.acceleration.shape}
+        if len(shapes) != 1 or self.position.ndim != 2 or self.position.shape[0] < 2:
+            raise InvalidTrajectory(f"position, velocity and acceleration need one shape (N+1, n), N ≥ 1; got {shapes}")
+        if not (np.isfinite(self.duration) and self.duration > 0):
+            raise InvalidTrajectory(f"duration must be a positive number of seconds, got {self.duration}")
+        if not all(np.isfinite(a).all() for a in (self.position, self.velocity, self.acceleration)):
+            raise InvalidTrajectory("a trajectory holds finite numbers only")
+
+    @property
+    def intervals(self) -> int:
+        """N, the number of grid intervals."""
+        return self.position.shape[0] - 1
+
+    @property
+    def times(self) -> Array:
+        """(N+1,) grid times from 0 to the duration (s)."""
+        return np.linspace(0.0, self.duration, self.intervals + 1)
+
+    def sample(self, t: float) -> JointState:
+        """State at one time, clamped to [0, duration]; see `sample_many`."""
+        position, velocity, acceleration = self.sample_many([t])
+        return JointState(float(t), position[0], velocity[0], acceleration[0])
+
+    def sample_many(self, times: ArrayLike) -> tuple[Array, Array, Array]:
+        """States between the grid points, consistent with the collocation.
+
+        The acceleration is linear between grid points and the velocity its integral: both meet the grid values, for
+        that is what the trapezoidal rule says of them. The integral of that velocity misses the grid positions by the
+        error of the rule, Δt²/12 (v[k+1] − v[k]); it is spread linearly over the interval, so that the position
+        is continuous and exact at the grid points too.
+
+        Args:
+            times: (M,) times in seconds, clamped to [0, duration].
+
+        Returns:
+            Position, velocity, acceleration, each (M, n).
+        """
+        step = self.duration / self.intervals
+        scaled = np.clip(np.asarray(times, dtype=float), 0.0, self.duration) / step
+        k = np.minimum(scaled.astype(int), self.intervals - 1)
+        s = (scaled - k)[:, None]
+        q, w, v = self.position[k], self.velocity[k], self.acceleration[k]
+        dv = self.acceleration[k + 1] - v
+        position = q + step * w * s + step**2 * (v * s**2 / 2 + dv * (s**3 / 6 + s / 12))
+        velocity = w + step * (v * s + dv * s**2 / 2)
+        return position, velocity, v + dv * s
+
+    def dynamics_defect(self) -> float:
+        """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
+        half_step = self.duration / self.intervals / 2
+        defect_q = np.diff(self.position, axis=0) - half_step * (self.velocity[1:] + self.velocity[:-1])
+        defect_w = np.diff(self.velocity, axis=0) - half_step * (self.acceleration[1:] + self.acceleration[:-1])
+        return float(max(np.abs(defect_q).max(), np.abs(defect_w).max()))
+
+
+@dataclass(frozen=True)
+class PlanSample:
+    """State of a plan at one time: the name of the phase, the arm (n joints) and the gripper (m joints)."""
+
+    phase: str
+    arm: JointState
+    gripper: JointState
+
+
+@dataclass(frozen=True)
+class GraspPlan:
+    """Approach, grasp and deliver for arm and gripper on one timeline.
+
+    Attributes:
+        arm: Three trajectories of the arm, in the order of `PHASE_NAMES`.
+        gripper: Three trajectories of the planned gripper joints; phase by phase of the same duration as the arm's.
+        start_time: Time of the first grid point on the common clock (s).
+        arm_joints: Names of the n arm joints.
+        gripper_joints: Names of the m gripper joints.
+
+    Raises:
+        InvalidTrajectory: Arm and gripper differ in duration, or positions or velocities jump at a join.
+    """
+
+    arm: tuple[Trajectory, Trajectory, Trajectory]
+    gripper: tuple[Trajectory, Trajectory, Trajectory]
+    start_time: float
+    arm_joints: tuple[str, ...]
+    gripper_joints: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("arm", "gripper", "arm_joints", "gripper_joints"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if not (len(self.arm) == len(self.gripper) == len(PHASE_NAMES)):
+            raise InvalidTrajectory(f"a plan has the phases {PHASE_NAMES} for arm and gripper")
+        for phases, joints, what in (
+            (self.arm, self.arm_joints, "arm"),
+            (self.gripper, self.gripper_joints, "gripper"),
+        ):
+            for phase, trajectory in zip(PHASE_NAMES, phases, strict=True):
+                if trajectory.position.shape[1] != len(joints):
+                    raise InvalidTrajectory(
+                        f"{what}, phase {phase}: {trajectory.position.shape[1]} columns for {len(joints)} joints"
+                    )
+            self._check_joins(phases, what)
+        for phase, arm, gripper in zip(PHASE_NAMES, self.arm, self.gripper, strict=True):
+            if abs(arm.duration - gripper.duration) > JOIN_TOLERANCE:
+                raise InvalidTrajectory(f"phase {phase}: arm takes {arm.duration} s, gripper {gripper.duration} s")
+
+    @staticmethod
+    def _check_joins(phases: tuple[Trajectory, ...], what: str) -> None:
+        for i in range(len(phases) - 1):
+            for name in ("position", "velocity"):
+                jump = float(np.abs(getattr(phases[i], name)[-1] - getattr(phases[i + 1], name)[0]).max())
+                if jump > JOIN_TOLERANCE:
+                    raise InvalidTrajectory(
+                        f"{what}: {name} jumps by {jump:.2e} between {PHASE_NAMES[i]} and {PHASE_NAMES[i + 1]}"
+                    )
+
+    @property
+    def durations(self) -> Array:
+        """(3,) durations of the phases (s)."""
+        return np.array([phase.duration for phase in self.arm])
+
+    @property
+    def phase_ends(self) -> Array:
+        """(3,) times T_1, T_2, T_3 at which the phases end, on the common clock (s)."""
+        return self.start_time + np.cumsum(self.durations)
+
+    @property
+    def end_time(self) -> float:
+        """Time at which the motion ends (s)."""
+        return float(self.phase_ends[-1])
+
+    def phase_at(self, t: float) -> int:
+        """Index of the phase that time `t` falls into; a join belongs to the later phase."""
+        return int(min(np.searchsorted(self.phase_ends, t, side="right"), len(PHASE_NAMES) - 1))
+
+    def sample(self, t: float) -> PlanSample:
+        """Arm and gripper at time `t` on the common clock, held at the ends of the plan."""
+        i = self.phase_at(t)
+        local = t - (self.phase_ends[i] - self.durations[i])
+        arm, gripper = self.arm[i].sample(local), self.gripper[i].sample(local)
+        if t > self.end_time:
+            arm, gripper = _at_rest(arm), _at_rest(gripper)
+        return PlanSample(
+            PHASE_NAMES[i],
+            JointState(t, arm.position, arm.velocity, arm.acceleration),
+            JointState(t, gripper.position, gripper.velocity, gripper.acceleration),
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan as JSON: per phase times, positions, velocities and accelerations of arm and gripper."""
+        document = {
+            "format": "dyngrasp.plan",
+            "version": 1,
+            "start_time": self.start_time,
+            "arm_joints": list(self.arm_joints),
+            "gripper_joints": list(self.gripper_joints),
+            "phases": [
+                {
+                    "name": name,
+                    "duration": arm.duration,
+                    "times": (arm.times + end - arm.duration).tolist(),
+                    "arm": _to_json(arm),
+                    "gripper": _to_json(gripper),
+                }
+                for name, end, arm, gripper in zip(PHASE_NAMES, self.phase_ends, self.arm, self.gripper, strict=True)
+            ],
+        }
+        Path(path).write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> GraspPlan:
+        """Read a plan that `save` wrote; numbers come back exactly.
+
+        Raises:
+            PlanFileError: The file is missing, is no such plan, or its trajectories do not make one.
+        """
+        try:
+            document = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise PlanFileError(path, None, None, f"cannot be read: {error.strerror}") from error
+        except ValueError as error:
+            raise PlanFileError(path, None, None, f"is not valid JSON: {error}") from error
+        if not isinstance(document, dict) or document.get("format") != "dyngrasp.plan":
+            raise PlanFileError(path, "format", None, 'must be "dyngrasp.plan"')
+        if document.get("version") != 1:
+            raise PlanFileError(path, "version", document.get("version"), "this release reads version 1")
+        try:
+            phases = document["phases"]
+            return cls(
+                arm=tuple(_from_json(phase["arm"], phase["duration"]) for phase in phases),  # type: ignore[arg-type]
+                gripper=tuple(_from_json(phase["gripper"], phase["duration"]) for phase in phases),  # type: ignore[arg-type]
+                start_time=float(document["start_time"]),
+                arm_joints=tuple(document["arm_joints"]),
+                gripper_joints=tuple(document["gripper_joints"]),
+            )
+        except KeyError as error:
+            raise PlanFileError(path, str(error.args[0]), None, "is missing") from error
+        except (TypeError, ValueError, InvalidTrajectory) as error:
+            raise PlanFileError(path, None, None, f"does not hold a plan: {error}") from error
+
+
+def _at_rest(state: JointState) -> JointState:
+    zero = np.zeros_like(state.position)
+    return JointState(state.t, state.position, zero, zero)
+
+
+def _to_json(trajectory: Trajectory) -> dict[str, Any]:
+    return {name: getattr(trajectory, name).tolist() for name in ("position", "velocity", "acceleration")}
+
+
+def _from_json(data: dict[str, Any], duration: float) -> Trajectory:
+    return Trajectory(duration, data["position"], data["velocity"], data["acceleration"])
