@@ -1,0 +1,1 @@
+"""The running loop: clock, episode and record."""

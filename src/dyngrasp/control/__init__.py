@@ -1,0 +1,1 @@
+"""Controllers of arm and gripper: joint state and plan in, torque out."""

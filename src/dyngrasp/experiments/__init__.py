@@ -1,0 +1,1 @@
+"""Scenarios, seeded trials and the metrics that judge them."""

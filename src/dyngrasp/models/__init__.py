@@ -1,0 +1,1 @@
+"""Robots, grippers and parts: what they are, read from their model files."""

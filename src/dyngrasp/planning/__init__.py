@@ -1,0 +1,1 @@
+"""From a part's pose to an audited plan of arm and hand."""

@@ -1,0 +1,1 @@
+"""The offline planner: trapezoidal collocation with free phase durations."""

@@ -1,0 +1,1 @@
+"""The plant: MuJoCo behind the Plant protocol, and the scene it holds."""
