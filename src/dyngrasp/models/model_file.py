@@ -7,6 +7,7 @@ turning any complaint into one :class:`~dyngrasp.errors.ModelFileError` that nam
 
 from __future__ import annotations
 
+import difflib
 import math
 import tomllib
 from pathlib import Path
@@ -122,7 +123,10 @@ def _first_offence(error: ValidationError, schema: type[BaseModel], data: dict[s
     offence = next((item for item in offences if item["type"] == "extra_forbidden"), offences[0])
     location = _keys_in_file(offence["loc"], data, missing=offence["type"] == "missing")
     if offence["type"] == "extra_forbidden":
-        expected = "no such key; valid: " + ", ".join(_valid_keys(schema, offence["loc"][:-1]))
+        valid = _valid_keys(schema, offence["loc"][:-1])
+        near = difflib.get_close_matches(str(offence["loc"][-1]), valid, n=1)
+        hint = f"did you mean `{near[0]}`? " if near else ""
+        expected = f"no such key; {hint}valid: " + ", ".join(valid)
     elif offence["type"] == "missing":
         expected = "the key is missing"
     else:
