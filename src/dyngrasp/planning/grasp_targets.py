@@ -225,8 +225,8 @@ def check_grasp(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> None:
     capacity = 2 * part.friction.torsional * gripper.pinch_force
     if capacity < settings.holding_safety * moment:
         raise GraspRefused(
-            f"{gripper.name} holds {capacity:.3f} Nm of torsion on {part.name}; its weight asks {moment:.3f} Nm about the "
-            f"pinch axis, and a safety factor of {settings.holding_safety:g} is required"
+            f"{gripper.name} holds {capacity:.3f} Nm of torsion on {part.name}; its weight asks {moment:.3f} Nm about "
+            f"the pinch axis, and a safety factor of {settings.holding_safety:g} is required"
         )
     grip = 2 * part.friction.sliding * gripper.pinch_force
     if grip < settings.holding_safety * part.mass * GRAVITY:

@@ -1,21 +1,17 @@
-"""What a planner is asked and what it answers: `PhaseProblem` → `Solution`, three of them make a `PlanResult`."""
+"""What a planner is asked and what it answers: `PhaseProblem` → `Solution`, three of them and an audit → `PlanResult`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
+import casadi
 import numpy as np
 
 from dyngrasp.errors import InvalidProblem, PlanningFailed
 from dyngrasp.signals import Array, read_only
 from dyngrasp.trajectory import GraspPlan, Trajectory
-
-if TYPE_CHECKING:
-    import casadi
-
-    from dyngrasp.planning.audit import AuditReport
 
 MIN_INTERVALS = 4  # two boundary states of two derivatives each leave no freedom on a coarser grid
 
@@ -151,7 +147,8 @@ class PhaseProblem:
             if (excess > rounding).any():
                 i = int(excess.argmax())
                 raise InvalidProblem(
-                    f"{self.name}: {end} velocity of joint {i + 1} is {w[i]:.4f} rad/s, limit {self.velocity_limit[i]:.4f}"
+                    f"{self.name}: {end} velocity of joint {i + 1} is {w[i]:.4f} rad/s, "
+                    f"limit {self.velocity_limit[i]:.4f}"
                 )
 
     @property
@@ -193,6 +190,67 @@ class Solution:
         if not self.ok or self.trajectory is None:
             raise PlanningFailed(f"{self.status}: {self.message}", self)
         return self.trajectory
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """The worst value of one constraint over a whole plan.
+
+    Attributes:
+        name: What was evaluated: "torque", "funnel", …
+        worst: The worst value found, in `unit`.
+        bound: What it must not exceed, or not fall below.
+        at_least: Whether `bound` is a lower bound.
+        tolerance: Rounding allowed beyond the bound, in `unit`.
+        unit: "m", "rad", "" for a ratio to a limit, …
+        time: When it occurs on the plan's clock (s).
+        detail: Which joint or which pair of bodies.
+    """
+
+    name: str
+    worst: float
+    bound: float
+    at_least: bool
+    tolerance: float
+    unit: str
+    time: float
+    detail: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the constraint holds everywhere; a NaN does not."""
+        excess = self.bound - self.worst if self.at_least else self.worst - self.bound
+        return bool(excess <= self.tolerance)
+
+    def __str__(self) -> str:
+        relation = "≥" if self.at_least else "≤"
+        where = f" ({self.detail})" if self.detail else ""
+        return (
+            f"{self.name} {self.worst:.4g} {self.unit} at {self.time:.3f} s{where}, must be {relation} {self.bound:.4g}"
+        )
+
+
+@dataclass(frozen=True)
+class AuditReport:
+    """Every constraint of a plan, evaluated independently of the solver that made it."""
+
+    entries: tuple[AuditEntry, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether the plan may be executed."""
+        return all(entry.ok for entry in self.entries)
+
+    @property
+    def failures(self) -> tuple[AuditEntry, ...]:
+        """The entries that do not hold."""
+        return tuple(entry for entry in self.entries if not entry.ok)
+
+    def __getitem__(self, name: str) -> AuditEntry:
+        for entry in self.entries:
+            if entry.name == name:
+                return entry
+        raise KeyError(f"no audit entry {name!r}; there are {', '.join(e.name for e in self.entries)}")
 
 
 @dataclass(frozen=True)
