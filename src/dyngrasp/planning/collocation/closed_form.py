@@ -1,0 +1,129 @@
+"""Minimum effort between two states in closed form, and the motion nearest to given accelerations that meets both ends.
+
+With s = t/T, w = T q̇, a = T² v and h = 1/N the trapezoidal rule, eq. (3b), is linear and free of T, and the two end
+values of a joint are linear in its accelerations: w_N − w_0 = Σ c_k a_k, q_N − q_0 − w_0 = Σ d_k a_k with
+
+    c = h (½, 1, …, 1, ½),    d = h² (N/2 − ¼, N−1, N−2, …, 1, ¼).
+
+Minimum Σ a² under two linear equations is a combination of c and d: two numbers a joint.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from dyngrasp.planning.problem import PhaseProblem
+from dyngrasp.signals import Array
+from dyngrasp.trajectory import Trajectory
+
+# A motion from a state at rest to itself costs least with no duration at all; a trajectory needs one (s).
+SHORTEST_DURATION = 1e-3
+
+
+@lru_cache(maxsize=64)
+def _end_map(intervals: int) -> tuple[Array, Array, Array]:
+    """(2, N+1) rows c and d, their (2, 2) Gram matrix and its inverse."""
+    h = 1.0 / intervals
+    c = np.full(intervals + 1, h)
+    c[[0, -1]] = h / 2
+    d = h**2 * np.arange(intervals, -1.0, -1.0)
+    d[0] = h**2 * (intervals / 2 - 0.25)
+    d[-1] = h**2 / 4
+    rows = np.vstack([c, d])
+    gram = rows @ rows.T
+    return rows, gram, np.linalg.inv(gram)
+
+
+def _end_change(problem: PhaseProblem, duration: float) -> Array:
+    """(2, n) what the accelerations must change: of w, and of q beyond coasting."""
+    coasting = duration * problem.start_velocity
+    return np.vstack(
+        [duration * problem.end_velocity - coasting, problem.end_position - problem.start_position - coasting]
+    )
+
+
+def integrate(start_position: Array, start_rate: Array, curvature: Array) -> tuple[Array, Array]:
+    """Positions and rates in normalised time from accelerations in normalised time, by the trapezoidal rule.
+
+    Args:
+        start_position: (n,) q_0.
+        start_rate: (n,) w_0 = T q̇_0.
+        curvature: (N+1, n) a = T² v.
+
+    Returns:
+        q and w, each (N+1, n).
+    """
+    half = 0.5 / (curvature.shape[0] - 1)
+    rate = np.empty_like(curvature)
+    rate[0] = start_rate
+    rate[1:] = start_rate + half * np.cumsum(curvature[1:] + curvature[:-1], axis=0)
+    position = np.empty_like(curvature)
+    position[0] = start_position
+    position[1:] = start_position + half * np.cumsum(rate[1:] + rate[:-1], axis=0)
+    return position, rate
+
+
+def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float) -> Trajectory:
+    """The motion that meets both boundary states with accelerations as near to the given ones as possible.
+
+    The least Σ|δa|² that closes the gap at the end is added; the dynamics and the boundary states then hold to
+    rounding, whatever solver the accelerations come from.
+
+    Args:
+        problem: Gives the boundary states and N.
+        curvature: (N+1, n) accelerations in normalised time, a = T² v.
+        duration: T (s).
+    """
+    rows, _, gram_inverse = _end_map(problem.intervals)
+    start_rate = duration * problem.start_velocity
+    change = _end_change(problem, duration)
+    curvature = curvature + rows.T @ (gram_inverse @ (change - rows @ curvature))
+    position, rate = integrate(problem.start_position, start_rate, curvature)
+    velocity = rate / duration
+    # The last grid point is the boundary state itself; the sums above differ from it by rounding only.
+    position[-1], velocity[0], velocity[-1] = problem.end_position, problem.start_velocity, problem.end_velocity
+    return Trajectory(duration, position, velocity, curvature / duration**2)
+
+
+def least_effort(problem: PhaseProblem, duration: float) -> Trajectory:
+    """The minimiser of Σ|v_k|² for a given duration under the boundary states alone."""
+    return nearest_trajectory(problem, np.zeros((problem.intervals + 1, problem.joints)), duration)
+
+
+def effort_coefficients(problem: PhaseProblem) -> tuple[float, float, float]:
+    """c0, c1, c2 of the least Σ|a_k|² = c0 + c1 T + c2 T² over all motions of duration T."""
+    _, _, gram_inverse = _end_map(problem.intervals)
+    fixed = _end_change(problem, 0.0)
+    linear = _end_change(problem, 1.0) - fixed
+    return (
+        float(np.sum(fixed * (gram_inverse @ fixed))),
+        2.0 * float(np.sum(fixed * (gram_inverse @ linear))),
+        float(np.sum(linear * (gram_inverse @ linear))),
+    )
+
+
+def least_cost(problem: PhaseProblem, duration: float) -> float:
+    """J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), the objective of `least_effort` (s)."""
+    c0, c1, c2 = effort_coefficients(problem)
+    return duration + problem.effort_weight / problem.intervals * (c0 / duration**3 + c1 / duration**2 + c2 / duration)
+
+
+def best_duration(problem: PhaseProblem) -> float:
+    """The duration within its bounds that minimises J(T): an end of the interval or a root of the quartic
+
+    T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
+    """
+    c0, c1, c2 = effort_coefficients(problem)
+    weight = problem.effort_weight / problem.intervals
+    roots = np.roots([1.0, 0.0, -weight * c2, -2 * weight * c1, -3 * weight * c0])
+    shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
+    # Complex pairs come with their real parts too: J decides, so a candidate too many does no harm.
+    candidates = np.clip(np.append(roots.real, [shortest, problem.max_duration]), shortest, problem.max_duration)
+    return float(min(candidates, key=lambda duration: least_cost(problem, duration)))
+
+
+def unconstrained_optimum(problem: PhaseProblem) -> Trajectory:
+    """The optimum of the phase without its inequalities; optimal for the phase if it satisfies them."""
+    return least_effort(problem, best_duration(problem))
