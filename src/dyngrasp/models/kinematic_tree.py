@@ -1,0 +1,117 @@
+"""Reading MJCF and URDF into Pinocchio, and what must hold of every tree before anything is computed with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.errors import ModelFileError
+
+REVOLUTE = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")
+
+
+def read_tree(description: Path, toml: Path, key: str) -> pin.Model:
+    """Read a tree of revolute joints.
+
+    Args:
+        description: The MJCF or URDF file.
+        toml: The model file that names it, for messages.
+        key: The key it is named under, "mjcf" or "urdf".
+
+    Returns:
+        Inertias, placements, armature (MJCF only) and gravity; the root body is fixed to the world.
+
+    Raises:
+        ModelFileError: The file is missing or unreadable, has a joint that is not revolute with limits, a moving link
+            without positive mass and inertia, or a number that is not finite.
+    """
+    if not description.is_file():
+        raise ModelFileError(toml, key, description.name, f"a file that exists; there is no {description}")
+    read = pin.buildModelFromMJCF if key == "mjcf" else pin.buildModelFromUrdf
+    try:
+        model = read(str(description))
+    except (RuntimeError, ValueError) as error:
+        raise ModelFileError(toml, key, description.name, f"a valid {key.upper()} file ({error})") from error
+    check_tree(model, description, toml, key)
+    return model
+
+
+def check_tree(model: pin.Model, description: Path, toml: Path, key: str) -> None:
+    """Refuse a tree that is not made of revolute joints and bodies that can exist.
+
+    Raises:
+        ModelFileError: As for `read_tree`.
+    """
+
+    def refuse(expected: str) -> ModelFileError:
+        return ModelFileError(toml, key, description.name, expected)
+
+    if model.njoints < 2:
+        raise refuse("a description with at least one revolute joint; it has none")
+    for joint, name, inertia, placement in zip(
+        list(model.joints)[1:],
+        list(model.names)[1:],
+        list(model.inertias)[1:],
+        list(model.jointPlacements)[1:],
+        strict=True,
+    ):
+        if joint.shortname() not in REVOLUTE:
+            raise refuse(
+                f"revolute joints with limits only; joint {name!r} is {joint.shortname().removeprefix('JointModel')}"
+            )
+        numbers = np.concatenate([inertia.toDynamicParameters(), placement.translation, placement.rotation.ravel()])
+        if not np.isfinite(numbers).all():
+            raise refuse(f"finite numbers only; the link moved by joint {name!r} or its placement has another one")
+        # A parser may drop an inertial element that it cannot read; then the mass is 0, which this finds as well.
+        if inertia.mass <= 0.0:
+            raise refuse(f"a mass > 0 for every moving link; the one moved by joint {name!r} has {inertia.mass:g} kg")
+        smallest = float(np.linalg.eigvalsh(inertia.inertia)[0])
+        if smallest <= 0.0:
+            raise refuse(
+                f"a positive definite inertia for every moving link; the one moved by joint {name!r} has the "
+                f"principal moment {smallest:g} kg m²"
+            )
+    if not np.isfinite(model.armature).all() or (model.armature < 0.0).any():
+        raise refuse(f"armatures ≥ 0; they are {model.armature.tolist()}")
+
+
+def require_chain(model: pin.Model, description: Path, toml: Path, key: str) -> None:
+    """Refuse a tree that branches.
+
+    Raises:
+        ModelFileError: Some joint is carried by another than the one before it.
+    """
+    for i in range(1, model.njoints):
+        if model.parents[i] != i - 1:
+            raise ModelFileError(
+                toml,
+                key,
+                description.name,
+                f"one serial chain; joint {model.names[i]!r} branches off at {model.names[model.parents[i]]!r}",
+            )
+
+
+def frame_id(model: pin.Model, name: str, toml: Path, key: str) -> int:
+    """Index of a site, body or link.
+
+    Raises:
+        ModelFileError: There is no such frame; the message lists those there are.
+    """
+    kinds = pin.FrameType.OP_FRAME | pin.FrameType.BODY
+    found = [i for i, frame in enumerate(model.frames) if frame.name == name and frame.type & kinds]
+    if len(found) != 1:
+        known = sorted({frame.name for frame in model.frames if frame.type & kinds})
+        raise ModelFileError(toml, key, name, f"the name of one site, body or link of the description: {known}")
+    return found[0]
+
+
+def require_length(values: tuple | None, length: int, toml: Path, key: str) -> None:
+    """Refuse an array of another length than `length`.
+
+    Raises:
+        ModelFileError: It has another length.
+    """
+    if values is not None and len(values) != length:
+        raise ModelFileError(toml, key, list(values), f"{length} numbers, one for each joint")
