@@ -1,0 +1,66 @@
+"""What the commands take; imports nothing heavy, so that `--help` answers at once."""
+
+from __future__ import annotations
+
+import argparse
+
+_SCENARIO = "a scenario file (TOML)"
+_SEED = "draws where the part lies and how the plant deviates; default: the scenario's own seed"
+_SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"
+
+
+def argument_parser(version: str) -> argparse.ArgumentParser:
+    """The parser of all commands; `command` holds the chosen one."""
+    parser = argparse.ArgumentParser(
+        prog="dyngrasp",
+        description="Plan dynamic grasps, carry them out in physics, and measure them.",
+        epilog="Exit status: 0 done and good, 1 done and not good (part not delivered), 2 bad input, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"dyngrasp {version}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="plan a grasp and carry it out in physics")
+    run.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
+    run.add_argument("--out", metavar="DIR", help="where the results go; default: out/<name of the scenario>")
+    run.add_argument("--seed", type=_seed, metavar="S", help=_SEED)
+    run.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
+    run.add_argument("--no-video", action="store_false", dest="video", help="do not render")
+
+    plan = commands.add_parser("plan", help="plan only and write the plan")
+    plan.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
+    plan.add_argument("--out", metavar="FILE", default="plan.json", help="where the plan goes; default: plan.json")
+    plan.add_argument("--seed", type=_seed, metavar="S", help=_SEED)
+    plan.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
+
+    study = commands.add_parser("study", help="run many seeded trials in local processes")
+    study.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
+    study.add_argument("--trials", type=_count, metavar="N", required=True, help="number of trials")
+    study.add_argument("--seed", type=_seed, metavar="S", help="every trial's own seed is drawn from this one")
+    study.add_argument("--out", metavar="DIR", required=True, help="where trials.parquet and study.json go")
+    study.add_argument("--workers", type=_count, metavar="W", help="processes; default: one a core")
+    study.add_argument("--json", metavar="FILE", help="write the rows also as JSON, with machine and versions")
+    study.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
+
+    commands.add_parser("models", help="list robots, grippers and objects")
+
+    check = commands.add_parser("check", help="validate model and scenario files")
+    check.add_argument("files", nargs="+", metavar="FILE", help="a model.toml or a scenario file")
+    return parser
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to 2**63 - 1 expected, got {text}")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of at least 1 expected, got {text}")
+    return value
+
+
+# argparse puts these names into its messages: "invalid whole number value: 'x'"
+_seed.__name__ = _count.__name__ = "whole number"

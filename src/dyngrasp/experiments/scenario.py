@@ -1,0 +1,270 @@
+"""What is to be run: a scenario file, decoded strictly, with overrides from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, create_model
+
+from dyngrasp.errors import ModelFileError, ScenarioError
+from dyngrasp.models.model_file import Finite, NonNegative, StrictSchema, decode, read_toml
+from dyngrasp.planning.grasp_targets import TaskSettings
+
+__all__ = [
+    "Range",
+    "Scenario",
+    "PartSection",
+    "PlannerSection",
+    "PlantSection",
+    "PoseSection",
+    "RenderSection",
+    "TaskSection",
+    "load_scenario",
+]
+
+OVERRIDE = "--set"
+"""What errors name in place of a file when the offending value came from an override."""
+
+_MODEL_KEYS = ("robot", "gripper", "object")
+
+
+def _as_range(value: Any) -> Any:
+    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError(f"a number or [low, high] with low ≤ high; {value[0]:g} > {value[1]:g}")
+    return value
+
+
+def _positive(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] <= 0:
+        raise ValueError(f"a number > 0 or [low, high] with 0 < low ≤ high, got {value[0]:g}")
+    return value
+
+
+def _within_reach_of_any_arm(value: tuple[float, float]) -> tuple[float, float]:
+    # Catches millimetres where metres belong; whether this arm reaches that far is for the planner to say.
+    if max(abs(value[0]), abs(value[1])) > 10.0:
+        raise ValueError("metres, at most 10 from the base")
+    return value
+
+
+def _whole_turns(value: Any) -> Any:
+    return (-180.0, 180.0) if value == "any" else _as_range(value)
+
+
+Range = Annotated[tuple[Finite, Finite], BeforeValidator(_as_range), AfterValidator(_ordered)]
+"""A number, or [low, high] from which each trial draws uniformly."""
+PositiveRange = Annotated[Range, AfterValidator(_positive)]
+Coordinate = Annotated[Range, AfterValidator(_within_reach_of_any_arm)]
+Yaw = Annotated[tuple[Finite, Finite], BeforeValidator(_whole_turns), AfterValidator(_ordered)]
+Degrees = Annotated[float, Field(ge=-360.0, le=360.0, allow_inf_nan=False)]
+Spread = Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)]
+
+
+def settings_schema(settings: type, *, leave_out: tuple[str, ...] = ()) -> type[StrictSchema]:
+    """The strict schema of a settings dataclass: the same keys, units and defaults, every number finite and ≥ 0.
+
+    Args:
+        settings: A frozen dataclass whose fields are numbers, Booleans and strings with defaults.
+        leave_out: Fields that the scenario sets elsewhere.
+    """
+    kinds: dict[type, Any] = {float: NonNegative, int: Annotated[int, Field(ge=0)], bool: bool, str: str}
+    fields: dict[str, Any] = {}
+    for item in dataclasses.fields(settings):
+        # numpy scalars appear as defaults that were computed, such as deg2rad(1)
+        default = item.default.item() if hasattr(item.default, "item") else item.default
+        if item.name not in leave_out and type(default) in kinds:
+            fields[item.name] = (kinds[type(default)], default)
+    return create_model(f"{settings.__name__}Section", __base__=StrictSchema, **fields)
+
+
+_TaskSettingsSection = settings_schema(TaskSettings)
+
+
+class TaskSection(StrictSchema):
+    """`[task]`: arm, gripper and part, by name in the catalogue or path of a model file, and where the motion begins and ends.
+
+    `start_deg` and `place_deg` hold one angle a joint. `settings` overrides fields of `TaskSettings`, in SI units.
+    """
+
+    robot: str
+    gripper: str
+    object: str
+    start_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    place_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
+    settings: _TaskSettingsSection = _TaskSettingsSection()  # type: ignore[valid-type]
+
+    @property
+    def task_settings(self) -> TaskSettings:
+        """The settings of the task."""
+        return TaskSettings(**self.settings.model_dump())  # type: ignore[attr-defined]
+
+
+class PartSection(StrictSchema):
+    """`[part]`: where the part lies; each key a number or a range from which each trial draws.
+
+    `yaw_deg = "any"` is a whole turn. Without `z_m` the part stands on the ground.
+    """
+
+    x_m: Coordinate
+    y_m: Coordinate
+    yaw_deg: Yaw
+    z_m: Coordinate | None = None
+
+
+class PlannerSection(StrictSchema):
+    """`[planner]`: `effort_weight` is ρ of eq. (3a) in s⁴/rad² (the paper: 1), `intervals` is N."""
+
+    backend: Literal["ipopt"] = "ipopt"
+    effort_weight: NonNegative = 1.0
+    intervals: Annotated[int, Field(ge=4, le=1000)] = 100
+
+
+class PoseSection(StrictSchema):
+    """`[pose]`: how far the pose that the planner gets is off the true one.
+
+    With `source = "noise"` each trial draws an error of the translation uniformly from a ball of radius `position_mm`
+    and a turn about a random axis by up to `rotation_deg`, about the grasp point. `along_mm`, `across_mm` and `up_mm`
+    are added on top, in the grasp frame (x along the rib, y across it, z outward); with `random_sign` each trial draws
+    their signs.
+    """
+
+    source: Literal["truth", "noise"] = "truth"
+    position_mm: NonNegative = 0.0
+    rotation_deg: NonNegative = 0.0
+    along_mm: Finite = 0.0
+    across_mm: Finite = 0.0
+    up_mm: Finite = 0.0
+    random_sign: bool = True
+
+
+class PlantSection(StrictSchema):
+    """`[plant]`: how the simulated plant differs from the models, see `PlantVariation.draw`.
+
+    `friction` is the sliding friction between pad and part; the torsional one is `torsional_over_sliding_m` times that.
+    The spreads are fractions: `mass_spread = 0.1` draws the part's mass within ±10 %.
+    """
+
+    control_rate_hz: Annotated[float, Field(ge=500.0, le=20000.0)] = 1000.0
+    friction: PositiveRange = (0.6, 0.9)
+    torsional_over_sliding_m: NonNegative = 0.0125
+    mass_spread: Spread = 0.1
+    armature_spread: Spread = 0.2
+    joint_friction_spread: Spread = 0.2
+
+
+class RenderSection(StrictSchema):
+    """`[render]`: the video of `dyngrasp run`."""
+
+    video: bool = True
+    frames_per_second: Annotated[float, Field(gt=0.0, le=240.0)] = 30.0
+    width: Annotated[int, Field(ge=64, le=4096, multiple_of=2)] = 960
+    height: Annotated[int, Field(ge=64, le=4096, multiple_of=2)] = 540
+
+
+class Scenario(StrictSchema):
+    """One scenario file. Units are in the names of the keys; `[task.settings]` is in SI units throughout."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    description: str = ""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    task: TaskSection
+    part: PartSection
+    planner: PlannerSection = PlannerSection()
+    pose: PoseSection = PoseSection()
+    plant: PlantSection = PlantSection()
+    render: RenderSection = RenderSection()
+
+
+def load_scenario(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scenario:
+    """Read a scenario file and apply overrides.
+
+    A file may begin with `extends = "other.toml"`, a path relative to itself: its own keys then go over the other's,
+    table by table. Paths of models are relative to the file that names them, in an override to the working directory.
+
+    Args:
+        path: The TOML file.
+        overrides: `key=value` with a dotted key and a TOML value; a plain word needs no quotes.
+
+    Raises:
+        ScenarioError: Names the file (or `--set`), the key, its value, and what would be valid.
+    """
+    document = _read(Path(path), ())
+    overridden = [_apply(document, text) for text in overrides]
+    try:
+        return decode(Scenario, document, path)
+    except ModelFileError as error:
+        key = error.key or ""
+        from_override = any(
+            key == o or key.startswith((f"{o}.", f"{o}[")) or o.startswith(f"{key}.") for o in overridden
+        )
+        raise ScenarioError(OVERRIDE if from_override else path, error.key, error.value, error.expected) from error
+
+
+def _read(path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
+    if path.resolve() in chain:
+        raise ScenarioError(chain[-1], "extends", str(path), "must not lead back to a file that extends this one")
+    try:
+        document = read_toml(path)
+    except ModelFileError as error:
+        raise ScenarioError(error.file, error.key, error.value, error.expected) from error
+    task = document.get("task")
+    if isinstance(task, dict):
+        for key in _MODEL_KEYS:
+            if key in task:
+                task[key] = _resolved(task[key], path.parent)
+    parent = document.pop("extends", None)
+    if parent is None:
+        return document
+    if not isinstance(parent, str):
+        raise ScenarioError(path, "extends", parent, "must be the path of a scenario file")
+    return _merged(_read(path.parent / parent, (*chain, path.resolve())), document)
+
+
+def _resolved(model: Any, folder: Path) -> Any:
+    """Names of the catalogue stay, paths become independent of the working directory."""
+    return str(folder / model) if isinstance(model, str) and model.endswith(".toml") else model
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(below)
+    for key, value in above.items():
+        both_tables = isinstance(value, dict) and isinstance(below.get(key), dict)
+        merged[key] = _merged(below[key], value) if both_tables else value
+    return merged
+
+
+def _apply(document: dict[str, Any], override: str) -> str:
+    """Put one `key=value` into the document; returns the dotted key."""
+    key, separator, text = override.partition("=")
+    key = key.strip()
+    if not separator or not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", key):
+        raise ScenarioError(OVERRIDE, None, None, f"expected key=value with a dotted key, got {override!r}")
+    *tables, last = key.split(".")
+    here = document
+    for depth, table in enumerate(tables):
+        here = here.setdefault(table, {})
+        if not isinstance(here, dict):
+            raise ScenarioError(OVERRIDE, key, text, f"`{'.'.join(tables[: depth + 1])}` is a value, not a table")
+    value = _value(key, text.strip())
+    if tables == ["task"] and last in _MODEL_KEYS:
+        value = _resolved(value, Path.cwd())
+    here[last] = value
+    return key
+
+
+def _value(key: str, text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        # The shell takes the quotes off strings, so a plain word or path is accepted without them.
+        if re.fullmatch(r"[A-Za-z_./~][\w./~+-]*", text):
+            return text
+    raise ScenarioError(OVERRIDE, key, text, 'expected a TOML value: a number, true, [1, 2] or "text"')
