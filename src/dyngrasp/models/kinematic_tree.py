@@ -9,6 +9,9 @@ import pinocchio as pin
 
 from dyngrasp.errors import ModelFileError
 
+ATTACHMENTS = (pin.FrameType.OP_FRAME, pin.FrameType.BODY)
+"""Frames that a model file may name: sites of an MJCF, bodies and links; joints, which may share a name, are not."""
+
 REVOLUTE = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")
 
 
@@ -93,16 +96,20 @@ def require_chain(model: pin.Model, description: Path, toml: Path, key: str) -> 
             )
 
 
+def frames_named(model: pin.Model, name: str) -> list[int]:
+    """Indices of the sites, bodies and links of that name."""
+    return [i for i, frame in enumerate(model.frames) if frame.name == name and frame.type in ATTACHMENTS]
+
+
 def frame_id(model: pin.Model, name: str, toml: Path, key: str) -> int:
     """Index of a site, body or link.
 
     Raises:
         ModelFileError: There is no such frame; the message lists those there are.
     """
-    kinds = pin.FrameType.OP_FRAME | pin.FrameType.BODY
-    found = [i for i, frame in enumerate(model.frames) if frame.name == name and frame.type & kinds]
+    found = frames_named(model, name)
     if len(found) != 1:
-        known = sorted({frame.name for frame in model.frames if frame.type & kinds})
+        known = sorted({frame.name for frame in model.frames if frame.type in ATTACHMENTS})
         raise ModelFileError(toml, key, name, f"the name of one site, body or link of the description: {known}")
     return found[0]
 

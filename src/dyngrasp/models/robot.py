@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.errors import ModelFileError
-from dyngrasp.models.kinematic_tree import frame_id, read_tree, require_chain, require_length
+from dyngrasp.models.kinematic_tree import frame_id, frames_named, read_tree, require_chain, require_length
 from dyngrasp.models.limits import JointLimits
 from dyngrasp.models.model_file import Finite, NonNegative, Positive, StrictSchema, decode, read_toml
 from dyngrasp.signals import Array
@@ -101,8 +101,7 @@ class RobotModel:
     @cached_property
     def tip_id(self) -> int:
         """Index of the flange frame in `pin_model`."""
-        kinds = pin.FrameType.OP_FRAME | pin.FrameType.BODY
-        return next(i for i, f in enumerate(self.pin_model.frames) if f.name == self.tip_frame and f.type & kinds)
+        return frames_named(self.pin_model, self.tip_frame)[0]
 
     @property
     def T_last_flange(self) -> pin.SE3:
