@@ -61,7 +61,7 @@ class TaskSettings:
     dexterity_min: float = 0.04
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GraspTask:
     """What is to be done: which arm and gripper take which part, and where to.
 
@@ -114,7 +114,7 @@ class BoundaryState:
             object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GraspTargets:
     """Boundary states of the three phases for one pose of the part.
 

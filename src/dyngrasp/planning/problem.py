@@ -1,4 +1,4 @@
-"""What a planner is asked and what it answers: `PhaseProblem` → `Solution`, three of them and an audit → `PlanResult`."""
+"""What a planner is asked and what it answers: `PhaseProblem` → `Solution`, a whole grasp → `PlanResult`."""
 
 from __future__ import annotations
 
