@@ -1,1 +1,1 @@
-"""Controllers of arm and gripper: joint state and plan in, torque out."""
+"""From a plan and sensor readings to joint torques."""

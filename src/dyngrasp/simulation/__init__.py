@@ -1,1 +1,1 @@
-"""The plant: MuJoCo behind the Plant protocol, and the scene it holds."""
+"""The simulated world: the only place that knows MuJoCo."""

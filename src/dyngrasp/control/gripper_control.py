@@ -1,0 +1,138 @@
+"""Control of the hand: position until the part is between the pads, then force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.control.velocity_filter import PAPER_TIME_CONSTANT, VelocityFilter
+from dyngrasp.models.gripper import GripperModel
+from dyngrasp.signals import Array, Observation
+from dyngrasp.trajectory import PlanSample
+
+
+@dataclass(frozen=True)
+class GripperControlSettings:
+    """Gains and forces of the hand controller.
+
+    Attributes:
+        bandwidth: ω of each joint about its own inertia (rad/s); higher rings against the differential filter.
+        damping: ζ.
+        contact_force: Pad force that counts as contact (N): above what a bump of the tactile signal gives, well below
+            a pinch.
+        over_close: How far the pads are asked to go beyond where the plan closes them (m, each): it keeps the position
+            loop pressing; more would leave it saturated, and a saturated loop has no stiffness against sideways forces.
+        force_fraction: Share of the torque limit that the squeeze takes; the rest is left to the position loop, which
+            holds the part sideways.
+        ramp: Time over which the squeeze rises (s). At once, it would kick the part; slower, the lift begins without it.
+        velocity_time_constant: T₁ of the differential filter (s).
+    """
+
+    bandwidth: float = 50.0
+    damping: float = 0.8
+    contact_force: float = 0.5
+    over_close: float = 1e-3
+    force_fraction: float = 0.7
+    ramp: float = 0.08
+    velocity_time_constant: float = PAPER_TIME_CONSTANT
+
+
+class GripperController:
+    """PD about the planned posture with inertia, damping and weight of the fingers fed forward; a squeeze after contact.
+
+    Contact is when every pad feels the part, or when the planned closing has ended. From then on the pads' planned gap is
+    reduced by `over_close` on each side and a feed-forward that presses them together along the closing axis ramps up.
+    Torques never pass the limits of the hand.
+
+    Args:
+        gripper: The hand.
+        dt: Control period (s).
+        settings: Gains and forces.
+    """
+
+    def __init__(self, gripper: GripperModel, dt: float, settings: GripperControlSettings | None = None) -> None:
+        self.settings = settings or GripperControlSettings()
+        self._gripper = gripper
+        self._model = pin.Model(gripper.pin_model)
+        self._data = self._model.createData()
+        self._columns = np.array([self._model.joints[self._model.getJointId(j)].idx_v for j in gripper.joint_names])
+        self._inertia = np.diag(self._mass_matrix(gripper.open_posture)).copy()
+        self._joint_damping = np.array(gripper.pin_model.damping)[self._columns]
+        self._filter = VelocityFilter(self.settings.velocity_time_constant, dt)
+        self._planned = VelocityFilter(self.settings.velocity_time_constant, dt)
+        self._squeeze_since: float | None = None
+        self.velocity = np.zeros(gripper.m)
+
+    @property
+    def squeezing(self) -> bool:
+        """Whether the hand presses."""
+        return self._squeeze_since is not None
+
+    def command(self, observation: Observation, sample: PlanSample, R_world_hand: Array) -> Array:
+        """Torques for this control period.
+
+        Args:
+            observation: Joint positions and pad forces now.
+            sample: What the plan asks for now.
+            R_world_hand: (3, 3) attitude of the hand, for the weight of the fingers.
+
+        Returns:
+            (m,) torques within the limits (Nm).
+        """
+        s, plan, gripper = self.settings, sample.gripper, self._gripper
+        q = observation.gripper_position
+        self.velocity = self._filter.update(q)
+        self._watch_contact(observation, sample)
+        target, squeeze = np.array(plan.position), np.zeros(gripper.m)
+        if self._squeeze_since is not None:
+            share = min((sample.gripper.t - self._squeeze_since) / s.ramp, 1.0)
+            target = target + share * self._over_closing(target)
+            squeeze = share * self._squeeze_torque(q)
+        error = target - q
+        error_rate = self._planned.update(target) - self.velocity
+        feedback = s.bandwidth**2 * error + 2 * s.damping * s.bandwidth * error_rate
+        torque = self._inertia * (plan.acceleration + feedback) + self._joint_damping * plan.velocity
+        torque += self._weight(q, R_world_hand) + squeeze
+        return np.clip(torque, -gripper.torque, gripper.torque)
+
+    def _watch_contact(self, observation: Observation, sample: PlanSample) -> None:
+        if sample.phase == "approach":
+            self._squeeze_since = None
+        elif self._squeeze_since is None:
+            touched = bool((observation.pad_force > self.settings.contact_force).all())
+            if touched or sample.phase == "deliver":
+                self._squeeze_since = sample.gripper.t
+
+    def _over_closing(self, posture: Array) -> Array:
+        """(m,) step along the closing motion that brings each pad `over_close` further (rad)."""
+        gripper = self._gripper
+        direction = gripper.closed_posture - gripper.open_posture
+        small = 1e-4
+        slope = (gripper.aperture(posture + small * direction) - gripper.aperture(posture)) / small
+        return direction * (-2 * self.settings.over_close / slope)
+
+    def _squeeze_torque(self, q: Array) -> Array:
+        """(m,) J_padᵀ F: the torques that press both pads together, the weakest joint at `force_fraction` of its limit."""
+        gripper = self._gripper
+        pin.computeJointJacobians(self._model, self._data, gripper.full_configuration(q))
+        pin.updateFramePlacements(self._model, self._data)
+        torque = np.zeros(gripper.m)
+        for side, frame in zip((-1.0, 1.0), gripper.pad_ids, strict=True):
+            inward = side * gripper.closing_axis
+            J = pin.getFrameJacobian(self._model, self._data, frame, pin.LOCAL_WORLD_ALIGNED)[:, self._columns]
+            # The pads touch at the foot of their arcs on the part: arc centre plus radius along the closing axis.
+            J_contact = J[:3] - pin.skew(gripper.pad_radius * inward) @ J[3:]
+            torque += J_contact.T @ inward
+        scale = self.settings.force_fraction / np.max(np.abs(torque) / gripper.torque)
+        return torque * min(scale, gripper.pinch_force)
+
+    def _weight(self, q: Array, R_world_hand: Array) -> Array:
+        self._model.gravity.linear = R_world_hand.T @ np.array([0.0, 0.0, -9.81])
+        weight = pin.computeGeneralizedGravity(self._model, self._data, self._gripper.full_configuration(q))
+        return weight[self._columns].copy()
+
+    def _mass_matrix(self, q_h: Array) -> Array:
+        upper = np.triu(pin.crba(self._model, self._data, self._gripper.full_configuration(q_h)))
+        return (upper + np.triu(upper, 1).T)[np.ix_(self._columns, self._columns)]

@@ -1,0 +1,88 @@
+"""The plant as controllers see it (`Plant`), and what only the record and the metrics may look at (`Truth`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol, runtime_checkable
+
+import pinocchio as pin
+
+from dyngrasp.signals import Array, Command, Observation, read_only
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """Joint torques in, sensor readings out. A simulator and a robot differ in nothing else."""
+
+    @property
+    def t(self) -> float:
+        """Time of the plant (s)."""
+        ...
+
+    def observe(self) -> Observation:
+        """What the sensors read now."""
+        ...
+
+    def step(self, command: Command) -> None:
+        """Apply the torques for one control period."""
+        ...
+
+
+class ContactCategory(IntEnum):
+    """Who touches whom; the index of the category in `Truth.contacts` and in the record."""
+
+    PADS_PART = 0
+    OTHER_ROBOT_PART = 1
+    ROBOT_GROUND = 2
+    PART_GROUND = 3
+    ROBOT_ROBOT = 4
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulator knows and no sensor tells.
+
+    Attributes:
+        t: Time (s).
+        T_world_part: Pose of the part's object frame.
+        part_twist: (6,), linear velocity of the object frame's origin (m/s) and angular velocity (rad/s), world axes.
+        T_world_hand: Pose of the hand frame.
+        p_world_grasp_point: (3,), midpoint of the two pad frames (m): the grasp point G as the fingers stand.
+        arm_position, arm_velocity: (n,) true joint states (rad, rad/s).
+        gripper_position, gripper_velocity: (m,) true states of the planned gripper joints (rad, rad/s).
+        arm_torque: (n,) torques that the motors applied, after saturation (Nm).
+        gripper_torque: (m,) likewise.
+        pad_force: (pads,) normal force between each pad and the part (N).
+        contacts: (5,) bool, whether contacts of each `ContactCategory` exist.
+    """
+
+    t: float
+    T_world_part: pin.SE3
+    part_twist: Array
+    T_world_hand: pin.SE3
+    p_world_grasp_point: Array
+    arm_position: Array
+    arm_velocity: Array
+    gripper_position: Array
+    gripper_velocity: Array
+    arm_torque: Array
+    gripper_torque: Array
+    pad_force: Array
+    contacts: tuple[bool, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "part_twist", read_only(self.part_twist, (6,)))
+        object.__setattr__(self, "p_world_grasp_point", read_only(self.p_world_grasp_point, (3,)))
+        for name in ("arm_position", "arm_velocity", "gripper_position", "gripper_velocity", "pad_force"):
+            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+        for name in ("arm_torque", "gripper_torque"):
+            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+
+
+class TruthfulPlant(Plant, Protocol):
+    """A plant that can also be asked for the truth, as any simulator can: for the record, never for control."""
+
+    def truth(self) -> Truth:
+        """The state that the sensors only hint at."""
+        ...
