@@ -14,6 +14,9 @@ ATTACHMENTS = (pin.FrameType.OP_FRAME, pin.FrameType.BODY)
 
 REVOLUTE = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")
 
+ROUNDED_MOMENTS = 1e-5
+"""Part of the largest principal moment by which figures of six digits may miss the triangle inequality."""
+
 
 def read_tree(description: Path, toml: Path, key: str) -> pin.Model:
     """Read a tree of revolute joints.
@@ -70,11 +73,17 @@ def check_tree(model: pin.Model, description: Path, toml: Path, key: str) -> Non
         # A parser may drop an inertial element that it cannot read; then the mass is 0, which this finds as well.
         if inertia.mass <= 0.0:
             raise refuse(f"a mass > 0 for every moving link; the one moved by joint {name!r} has {inertia.mass:g} kg")
-        smallest = float(np.linalg.eigvalsh(inertia.inertia)[0])
+        moments = np.linalg.eigvalsh(inertia.inertia)
+        smallest = float(moments[0])
         if smallest <= 0.0:
             raise refuse(
                 f"a positive definite inertia for every moving link; the one moved by joint {name!r} has the "
                 f"principal moment {smallest:g} kg m²"
+            )
+        if moments[0] + moments[1] < moments[2] * (1.0 - ROUNDED_MOMENTS):
+            raise refuse(
+                f"principal moments of which no one exceeds the sum of the others; those of the link moved by joint "
+                f"{name!r} are {np.round(moments, 9).tolist()} kg m², which no body has"
             )
     if not np.isfinite(model.armature).all() or (model.armature < 0.0).any():
         raise refuse(f"armatures ≥ 0; they are {model.armature.tolist()}")
