@@ -12,7 +12,7 @@ import pinocchio as pin
 from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.grasp_object import Grasp, GraspObject
 from dyngrasp.models.gripper import GripperModel
-from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity, null_space_rate
+from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.signals import Array, read_only
 
@@ -300,7 +300,7 @@ def _swivel_velocity(q: Array, q_start: Array, task: GraspTask, like: Array | No
 
     It turns the way the motion from start to target goes on the whole, or the way of `like` if given.
     """
-    rate = null_space_rate(task.robot, q)
+    rate = inverse_kinematics_for(task.robot).null_space_rate(q)
     ratio = float(np.abs(rate / task.robot.limits.velocity).max())
     if ratio == 0.0:
         return np.zeros_like(q)
