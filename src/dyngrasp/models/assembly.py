@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from dyngrasp.errors import ModelFileError
 from dyngrasp.models.gripper import GripperModel
@@ -39,8 +40,8 @@ class Assembly:
     arm_geoms: tuple[str, ...]
     hand_geoms: tuple[str, ...]
     pad_geoms: tuple[str, ...]
-    arm_indices: Array
-    hand_indices: Array
+    arm_indices: NDArray[np.intp]
+    hand_indices: NDArray[np.intp]
     flange_id: int
 
     def configuration(self, q: Array, q_h: Array) -> Array:
@@ -105,7 +106,7 @@ def assemble(robot: RobotModel, gripper: GripperModel) -> Assembly:
                 armature[at] = part.armature[part.joints[joint].idx_v]
     whole.armature = armature
 
-    def indices(names: tuple[str, ...]) -> Array:
+    def indices(names: tuple[str, ...]) -> NDArray[np.intp]:
         return np.array([whole.joints[whole.getJointId(name)].idx_q for name in names])
 
     return Assembly(

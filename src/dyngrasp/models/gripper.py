@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import brentq
 
@@ -135,7 +136,7 @@ class GripperModel:
         return self.pin_model.createData()
 
     @cached_property
-    def planned_indices(self) -> Array:
+    def planned_indices(self) -> NDArray[np.intp]:
         """(m,) index of each planned joint in a configuration of `pin_model`."""
         return np.array([self.pin_model.joints[self.pin_model.getJointId(name)].idx_q for name in self.joint_names])
 
@@ -170,10 +171,10 @@ class GripperModel:
         """(3, m) derivative of p_G with respect to q_h (m/rad)."""
         pin.computeJointJacobians(self.pin_model, self._data, self.full_configuration(q_h))
         pin.updateFramePlacements(self.pin_model, self._data)
-        rows = sum(
+        first, second = (
             pin.getFrameJacobian(self.pin_model, self._data, i, pin.LOCAL_WORLD_ALIGNED)[:3] for i in self.pad_ids
         )
-        return rows[:, self.planned_indices] / 2
+        return (first + second)[:, self.planned_indices] / 2
 
     def aperture(self, q_h: Array) -> float:
         """Free gap between the pads along the closing axis (m), negative where they would overlap."""
@@ -214,7 +215,7 @@ class GripperModel:
         if gap <= low:
             return self.closed_posture.copy()
         fraction = brentq(lambda x: self.aperture(self.closing_posture(x)) - gap, 0.0, 1.0, xtol=1e-12)
-        return self.closing_posture(float(fraction))
+        return self.closing_posture(fraction)  # type: ignore[arg-type]  # a float, unless the full output is asked for
 
     def inertia(self, q_h: Array) -> pin.Inertia:
         """Inertia of the whole hand at posture q_h (m,), in the hand frame."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ class JointLimits:
         position_upper: Largest position (rad).
         velocity: Largest |q̇| (rad/s).
         torque: Largest |τ| (Nm).
-        acceleration: Largest |q̈| (rad/s²), +inf where only the torque limits it.
+        acceleration: Largest |q̈| (rad/s²), +inf where only the torque limits it; one number stands for all joints.
         coriolis: Bounds c on |C(q, q̇) q̇| (Nm) by which torque rows that leave this term out are tightened.
 
     Raises:
@@ -39,15 +39,14 @@ class JointLimits:
     position_upper: Array
     velocity: Array
     torque: Array
-    acceleration: Array | None = None
-    coriolis: Array | None = None
+    acceleration: Array = field(default_factory=lambda: np.array(np.inf))
+    coriolis: Array = field(default_factory=lambda: np.array(0.0))
 
     def __post_init__(self) -> None:
         n = np.size(self.position_lower)
-        if self.acceleration is None:
-            object.__setattr__(self, "acceleration", np.full(n, np.inf))
-        if self.coriolis is None:
-            object.__setattr__(self, "coriolis", np.zeros(n))
+        for name in ("acceleration", "coriolis"):
+            if np.ndim(getattr(self, name)) == 0:
+                object.__setattr__(self, name, np.full(n, getattr(self, name)))
         for name in ("position_lower", "position_upper", "velocity", "torque", "acceleration", "coriolis"):
             try:
                 object.__setattr__(self, name, read_only(getattr(self, name), (n,)))

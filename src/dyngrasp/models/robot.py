@@ -268,6 +268,6 @@ def _limits(table: LimitsTable, model: pin.Model, path: Path) -> JointLimits:
         position_upper=upper,
         velocity=np.deg2rad(table.velocity_deg_per_s),
         torque=np.array(table.torque_nm),
-        acceleration=None if acceleration is None else np.deg2rad(acceleration),
-        coriolis=None if coriolis is None else np.array(coriolis),
+        acceleration=np.array(np.inf) if acceleration is None else np.deg2rad(acceleration),
+        coriolis=np.array(0.0 if coriolis is None else coriolis),
     )
