@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.optimize import brentq
 
 from dyngrasp.errors import GraspRefused, ModelFileError
-from dyngrasp.models.kinematic_tree import frame_id, frames_named, read_tree, require_length
+from dyngrasp.models.kinematic_tree import frame_id, frames_named, read_tree, require_in_range, require_length
 from dyngrasp.models.model_file import Finite, Positive, StrictSchema, UnitQuaternion, Vector3, decode, read_toml
 from dyngrasp.signals import Array, read_only
 
@@ -319,19 +319,10 @@ def _check_joints(table: GripperFile, model: pin.Model, path: Path) -> None:
                     f"within the limits of {table.joints[i]!r}, {low} to {high} deg",
                 )
     for name, angle in table.locked.items():
-        _check_range(model, name, angle, path, f"locked.{name}")
+        require_in_range(model, name, angle, path, f"locked.{name}")
     for key in ("position_lower_deg", "position_upper_deg"):
         for i, angle_deg in enumerate(getattr(table.limits, key)):
-            _check_range(model, table.joints[i], float(np.deg2rad(angle_deg)), path, f"limits.{key}[{i}]")
-
-
-def _check_range(model: pin.Model, name: str, angle: float, path: Path, key: str) -> None:
-    i = model.joints[model.getJointId(name)].idx_q
-    low, high = model.lowerPositionLimit[i], model.upperPositionLimit[i]
-    if not low - ROUNDING <= angle <= high + ROUNDING:
-        raise ModelFileError(
-            path, key, angle, f"within the range of joint {name!r} in the description, {low:.6g} to {high:.6g} rad"
-        )
+            require_in_range(model, table.joints[i], float(np.deg2rad(angle_deg)), path, f"limits.{key}[{i}]")
 
 
 def _check_pad_geoms(table: GripperFile, model: pin.Model, mjcf: Path, path: Path) -> None:

@@ -14,6 +14,8 @@ ATTACHMENTS = (pin.FrameType.OP_FRAME, pin.FrameType.BODY)
 
 REVOLUTE = ("JointModelRX", "JointModelRY", "JointModelRZ", "JointModelRevoluteUnaligned")
 
+ROUNDED_ANGLE = 1e-6  # rad
+
 ROUNDED_MOMENTS = 1e-5
 """Part of the largest principal moment by which figures of six digits may miss the triangle inequality."""
 
@@ -131,3 +133,17 @@ def require_length(values: tuple | None, length: int, toml: Path, key: str) -> N
     """
     if values is not None and len(values) != length:
         raise ModelFileError(toml, key, list(values), f"{length} numbers, one for each joint")
+
+
+def require_in_range(model: pin.Model, joint: str, angle: float, toml: Path, key: str) -> None:
+    """Refuse an angle (rad) outside the range that the description gives the joint.
+
+    Raises:
+        ModelFileError: It is outside by more than angles written with six decimals may be.
+    """
+    i = model.joints[model.getJointId(joint)].idx_q
+    low, high = model.lowerPositionLimit[i], model.upperPositionLimit[i]
+    if not low - ROUNDED_ANGLE <= angle <= high + ROUNDED_ANGLE:
+        raise ModelFileError(
+            toml, key, angle, f"within the range of joint {joint!r} in the description, {low:.6g} to {high:.6g} rad"
+        )
