@@ -108,6 +108,23 @@ def test_a_redundant_solution_lies_on_the_closed_form_of_its_own_arm_angle() -> 
     np.testing.assert_array_equal(found, NUMERICAL.solutions(T, count=40))
 
 
+def test_any_chain_is_solved(robot: RobotModel) -> None:
+    solver, random = DampedLeastSquares(robot), np.random.default_rng(11)
+    lower, upper = robot.limits.position_lower, robot.limits.position_upper
+    for _ in range(10):
+        q = random.uniform(lower, upper)
+        T, reference = robot.forward_kinematics(q), np.clip(q + random.uniform(-0.2, 0.2, robot.n), lower, upper)
+        found = solver.nearest(T, reference)
+        assert max(errors(robot, found, T)) < 1.01e-10
+        assert ((found >= lower) & (found <= upper)).all()
+        # q itself is a solution, so the nearest one found by descent is no farther; six joints have no choice.
+        if robot.n > 6:
+            weight = 1.0 / robot.limits.velocity
+            assert (((found - reference) * weight) ** 2).sum() <= (((q - reference) * weight) ** 2).sum() + 1e-12
+        twist = random.normal(size=6)
+        assert np.abs(robot.jacobian(q) @ joint_velocity(robot, q, twist) - twist).max() < 1e-8
+
+
 def test_six_joints_have_the_solutions_of_the_closed_form_with_q3_zero() -> None:
     arm = six_joint_arm()
     for q in random_postures(4, seed=5):
@@ -172,6 +189,14 @@ def test_null_vector_holds_the_flange_and_turns_without_jumps() -> None:
 
 def test_six_joints_have_no_null_space() -> None:
     np.testing.assert_array_equal(DampedLeastSquares(six_joint_arm()).null_space_rate(np.full(6, 0.4)), np.zeros(6))
+
+
+def test_the_null_space_of_eight_joints_is_refused(robot: RobotModel) -> None:
+    if robot.n <= 7:
+        assert np.shape(DampedLeastSquares(robot).null_space_rate(np.zeros(robot.n))) == (robot.n,)
+        return
+    with pytest.raises(InvalidProblem, match="not a line"):
+        DampedLeastSquares(robot).null_space_rate(np.zeros(robot.n))
 
 
 finite = st.floats(-0.5, 0.5)

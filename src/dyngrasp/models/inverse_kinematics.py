@@ -18,7 +18,7 @@ from dyngrasp.models.srs_kinematics import SrsKinematics
 from dyngrasp.signals import Array
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
     from dyngrasp.models.robot import RobotModel
 
@@ -93,7 +93,7 @@ def joint_velocity(robot: RobotModel, q: ArrayLike, twist_world: ArrayLike, swiv
     if twist.shape != (6,) or not np.isfinite(twist).all() or not math.isfinite(swivel_rate):
         raise InvalidProblem(f"six finite numbers of a twist and a finite swivel rate expected: {twist}, {swivel_rate}")
     J = robot.jacobian(q)
-    rate = np.linalg.lstsq(J, twist, rcond=_RATE_CUTOFF)[0]
+    rate: Array = np.linalg.lstsq(J, twist, rcond=_RATE_CUTOFF)[0].astype(float)
     missing = float(np.linalg.norm(J @ rate - twist))
     if missing > TWIST_TOLERANCE * max(1.0, float(np.linalg.norm(twist))):
         raise InvalidProblem(
@@ -126,13 +126,13 @@ class DampedLeastSquaresSettings:
     reference_steps: int = 60
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DampedLeastSquares:
     """Inverse kinematics of any serial arm by the Levenberg–Marquardt method.
 
-    The damping follows the squared error (Sugihara 2011, doi:10.1109/TRO.2011.2148230), so that convergence is quadratic
-    near a solution and steps stay bounded near a singularity. Joints that a step would push through a limit stay on it,
-    and the step is solved again for the others.
+    The damping follows the squared error (Sugihara 2011, doi:10.1109/TRO.2011.2148230), so that convergence is
+    quadratic near a solution and steps stay bounded near a singularity. Joints that a step would push through a limit
+    stay on it, and the step is solved again for the others.
 
     Attributes:
         robot: The arm.
@@ -189,7 +189,9 @@ class DampedLeastSquares:
         if self.robot.n < 7:
             return np.zeros(self.robot.n)
         if self.robot.n > 7:
-            raise InvalidProblem(f"{self.robot.name} has {self.robot.n} joints: its null space is not a line")
+            raise InvalidProblem(
+                f"{self.robot.name} has {self.robot.n} joints: its null space is not a line; use a swivel rate of 0"
+            )
         J = self.robot.jacobian(q)
         rate = np.linalg.svd(J)[2][-1]
         return rate if np.linalg.det(np.vstack([J, rate])) >= 0.0 else -rate
@@ -288,7 +290,7 @@ class DampedLeastSquares:
                     break
         return q
 
-    def _towards(self, J: Array, q: Array, q_reference: Array, free: Array) -> Array:
+    def _towards(self, J: Array, q: Array, q_reference: Array, free: NDArray[np.bool_]) -> Array:
         speed = self.robot.limits.velocity[free]
         J_scaled = J[:, free] * speed
         wish = (q_reference - q)[free] / speed
@@ -299,7 +301,7 @@ class DampedLeastSquares:
 class StepOfFreeJoints(Protocol):
     """A step of those joints that are free."""
 
-    def __call__(self, free: Array) -> Array:
+    def __call__(self, free: NDArray[np.bool_]) -> Array:
         """Step (count of free,) for a mask (n,)."""
         ...
 

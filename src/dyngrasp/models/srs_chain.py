@@ -1,0 +1,280 @@
+"""Geometry of an S-R-S arm (spherical shoulder, revolute elbow, spherical wrist), joint limits aside.
+
+Chain: seven joints about z, y, z, −y, z, y, z, all frames parallel to the base at q = 0, where the arm stands straight
+up. The fourth axis points along −y: a positive elbow angle turns the forearm towards −x, the manufacturer's sign of the
+KUKA LBR iiwa.
+
+With shoulder S, elbow E and wrist W fixed at their distances, a flange pose leaves one freedom: E moves on a circle
+about the line S–W.
+
+**Arm angle ψ** (rad, in (−π, π]): the angle, right-handed about u = (W − S)/|W − S|, from the *reference direction* to
+the direction from that line to E. The reference direction is the part of the base's z axis that is perpendicular to u:
+at ψ = 0 the elbow lies in the vertical plane through S and W, above the line. Two fallbacks complete the definition:
+
+- S–W parallel to the base's z axis (closer than `VERTICAL` rad): the reference direction is the base's x axis.
+- Elbow straight (q4 = 0): E lies on the line, and the axis of joint 4 says where it would move for q4 → 0⁺.
+
+ψ depends on q continuously except at the first case and where q4 changes sign: there E changes side and ψ jumps by π.
+
+**Branches**: the same ψ is reached with each sign of q2, q4 and q6. Branch b = 1·[q2 < 0] + 2·[q4 < 0] + 4·[q6 < 0].
+
+Where q2 (or q6) is 0 or π only the sum or the difference of its two neighbours matters; they then share it equally.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.errors import InvalidProblem, OutOfReach
+from dyngrasp.signals import Array, read_only
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["BRANCHES", "ROUNDING", "ElbowCircle", "SrsChain", "joint_vector"]
+
+BRANCHES = 8
+VERTICAL = 1e-9
+"""Angle (rad) between S–W and the base's z axis below which the reference direction is x: rounding alone makes the
+direction of the perpendicular part of z uncertain by 1e-16 / 1e-9 rad, still far below any use of ψ."""
+ROUNDING = 1e-10
+"""How far (m, rad) a pose or a joint may pass the edge of what is possible and still be put down to rounding. It is
+then set on the edge, which moves the flange by about as much."""
+STRAIGHT = 1e-7
+"""Elbow angle (rad) below which it is taken as zero. The reach depends on it in second order only: this moves the
+flange by 1e-15 m, whereas an angle that is rounding alone would give the joints beside it an arbitrary turn."""
+_ALIGNED = 1e-12
+_NEARLY_ALIGNED = 1e-6
+
+_, _Y, _Z = np.eye(3)
+_AXES = (_Z, _Y, _Z, -_Y, _Z, _Y, _Z)
+_BITS = (np.arange(BRANCHES)[:, None] >> np.arange(3)) & 1
+_SIGNS = np.ones((BRANCHES, 7))
+_SIGNS[:, [1, 3, 5]] = 1.0 - 2.0 * _BITS
+# Rz(α) Ry(β) Rz(γ) = Rz(α+π) Ry(−β) Rz(γ+π): a changed sign of q2, q4 or q6 costs a half turn of both neighbours.
+_TURNS = np.zeros((BRANCHES, 7))
+_TURNS[:, 0], _TURNS[:, 2] = _BITS[:, 0], _BITS[:, 0] + _BITS[:, 1]
+_TURNS[:, 4], _TURNS[:, 6] = _BITS[:, 1] + _BITS[:, 2], _BITS[:, 2]
+_TURNS *= math.pi
+
+
+@dataclass(frozen=True, eq=False)
+class ElbowCircle:
+    """The circle of the elbow that one flange pose leaves.
+
+    Attributes:
+        elbow: |q4| (rad).
+        rotations: (3, 18), R03 and R47 row by row for q4 ≥ 0, as coefficients of (cos ψ, sin ψ, 1).
+    """
+
+    elbow: float
+    rotations: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SrsChain:
+    """An S-R-S arm without joint limits.
+
+    Attributes:
+        lengths: (4,) base to shoulder, shoulder to elbow, elbow to wrist, wrist to flange (m).
+
+    Raises:
+        InvalidProblem: Not four finite lengths with the middle two positive.
+    """
+
+    lengths: Array
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "lengths", read_only(self.lengths, (4,)))
+        except ValueError as error:
+            raise InvalidProblem(f"lengths of an S-R-S arm: {error}") from error
+        if not (np.isfinite(self.lengths).all() and (self.lengths[1:3] > 0.0).all()):
+            raise InvalidProblem(
+                f"lengths of an S-R-S arm: finite, upper arm and forearm positive; got {self.lengths.tolist()}"
+            )
+
+    def forward_kinematics(self, q: ArrayLike) -> pin.SE3:
+        """T_world_flange at a configuration q (7,) (rad)."""
+        base, a, b, tool = self.lengths
+        rotation, position = np.eye(3), np.array([0.0, 0.0, base])
+        for angle, axis, length in zip(joint_vector(q), _AXES, (0.0, 0.0, a, 0.0, b, 0.0, tool), strict=True):
+            rotation = rotation @ pin.AngleAxis(float(angle), axis).matrix()
+            position = position + length * rotation[:, 2]
+        return pin.SE3(rotation, position)
+
+    def reach(self, elbow: float) -> float:
+        """Distance S–W (m) at an elbow angle (rad)."""
+        _, a, b, _ = self.lengths
+        return math.sqrt(max(a * a + b * b + 2.0 * a * b * math.cos(elbow), 0.0))
+
+    def branch(self, q: ArrayLike) -> int:
+        """Branch of a configuration q (7,), 0 to 7; a joint at exactly zero counts as positive."""
+        q = joint_vector(q)
+        return int(q[1] < 0.0) + 2 * int(q[3] < 0.0) + 4 * int(q[5] < 0.0)
+
+    def arm_angle(self, q: ArrayLike) -> float:
+        """Arm angle ψ (rad, in (−π, π]) of a configuration q (7,) (rad); the module states the convention."""
+        q = joint_vector(q)
+        u, elbow_axis = self._shoulder_to_wrist(q)
+        # Joint 4's axis instead of the elbow's offset from S–W: it keeps its direction where the offset vanishes.
+        h = np.cross(u, elbow_axis) if q[3] < 0.0 else np.cross(elbow_axis, u)
+        e, g = _reference_directions(*u)
+        return math.atan2(h @ g, h @ e)
+
+    def null_space_rate(self, q: ArrayLike) -> Array:
+        """Joint rates dq/dψ (7,) that turn the elbow about S–W at 1 rad/s and keep the flange where it is.
+
+        The rates grow without bound as q2 or q6 approaches 0 or π, where in general no finite rates turn the elbow.
+        Closer than 1e-6 the rates are therefore scaled to length one: J · rate = 0 holds everywhere, unit arm-angle
+        rate does not hold there. Where the elbow turns all the same (the straight arm), the unit rate is kept.
+        """
+        q = joint_vector(q)
+        _, a, b, _ = self.lengths
+        u, _ = self._shoulder_to_wrist(q)
+        shoulder, k_s = _euler_rates(q[0], q[1], u)
+        L = self.reach(q[3])
+        if L < _ALIGNED:
+            raise InvalidProblem("the wrist centre lies on the shoulder centre: there is no arm angle")
+        wrist, k_w = _euler_rates(q[4], q[5], np.array([-a * math.sin(q[3]), 0.0, -(b + a * math.cos(q[3]))]) / L)
+        rate = np.concatenate([k_w * shoulder, [0.0], k_s * wrist])
+        if k_s == 1.0 and k_w == 1.0:
+            return rate
+        if k_s == 0.0 and k_w == 0.0:
+            rate[:3] = shoulder
+        return rate / np.linalg.norm(rate)
+
+    def circle(self, T_world_flange: pin.SE3, nearest: float, farthest: float) -> ElbowCircle:
+        """The circle of the elbow for a flange pose.
+
+        Args:
+            T_world_flange: Pose of the flange.
+            nearest: Smallest distance S–W (m) that the elbow allows.
+            farthest: Largest distance S–W (m) that the elbow allows.
+
+        Raises:
+            OutOfReach: The distance is outside these by more than rounding; `distance` says how far.
+            InvalidProblem: A pose that is not finite.
+        """
+        R, p = T_world_flange.rotation, T_world_flange.translation
+        if not (np.isfinite(R).all() and np.isfinite(p).all()):
+            raise InvalidProblem("the flange pose holds a number that is not finite")
+        base, a, b, tool = self.lengths
+        wx, wy, wz = (float(v) for v in p - tool * R[:, 2])
+        wz -= base
+        L = math.sqrt(wx * wx + wy * wy + wz * wz)
+        excess = max(L - farthest, nearest - L)
+        if excess > ROUNDING or L < _ALIGNED:
+            how = "farther than the arm reaches" if farthest < L else "nearer than the elbow can fold"
+            where = f"the wrist centre would be {L:.6g} m from the shoulder, {max(excess, 0.0):.3g} m {how}"
+            raise OutOfReach("the flange pose", max(excess, 0.0), where)
+        u = np.array([wx / L, wy / L, wz / L])
+        L = min(max(L, nearest), farthest)
+        # The half-angle form keeps its precision near the straight and the folded elbow; acos loses half the digits.
+        elbow = 2.0 * math.atan2(
+            math.sqrt(max((a + b - L) * (a + b + L), 0.0)), math.sqrt(max((L - abs(a - b)) * (L + abs(a - b)), 0.0))
+        )
+        if elbow < STRAIGHT:
+            elbow = 0.0
+        s4, c4 = math.sin(elbow), math.cos(elbow)
+        sin_alpha, cos_alpha = b * s4 / L, (a + b * c4) / L
+        e, g = _reference_directions(*u)
+        # Elbow direction h = cos ψ e + sin ψ g; columns of R03 for q4 ≥ 0: x = cos α h − sin α u, y = u × h,
+        # z = cos α u + sin α h, with α the angle at the shoulder between S–W and the upper arm.
+        R03 = np.zeros((3, 3, 3))
+        for k, (h, u_cross_h) in enumerate(((e, g), (g, -e))):
+            R03[k, :, 0], R03[k, :, 1], R03[k, :, 2] = cos_alpha * h, u_cross_h, sin_alpha * h
+        R03[2, :, 0], R03[2, :, 2] = -sin_alpha * u, cos_alpha * u
+        R34 = np.array([[c4, 0.0, -s4], [0.0, 1.0, 0.0], [s4, 0.0, c4]])
+        R47 = np.swapaxes(R03 @ R34, 1, 2) @ R
+        return ElbowCircle(elbow, np.concatenate([R03.reshape(3, 9), R47.reshape(3, 9)], axis=1))
+
+    def configurations(self, circle: ElbowCircle, psi: Array, branches: int | NDArray[np.int64] | None = None) -> Array:
+        """Joint angles (rad, whole turns arbitrary) at arm angles psi (m,).
+
+        (m, 7) on the given branch of each arm angle, or (m, 8, 7) on all branches.
+        """
+        m = psi.size
+        weights = np.empty((m, 3))
+        weights[:, 0], weights[:, 1], weights[:, 2] = np.cos(psi), np.sin(psi), 1.0
+        # Shoulder and wrist in one sweep.
+        angles, aligned = _zyz_angles((weights @ circle.rotations).reshape(m, 2, 9))
+        first = np.empty((m, 7))
+        first[:, :3], first[:, 3], first[:, 4:] = angles[:, 0], circle.elbow, angles[:, 1]
+        every = branches is None
+        q = first[:, None] * _SIGNS + _TURNS if every else first * _SIGNS[branches] + _TURNS[branches]
+        if aligned.any():
+            _share_turns(q, angles, aligned)
+        return q
+
+    def _shoulder_to_wrist(self, q: Array) -> tuple[Array, Array]:
+        """Unit vector u from S to W and the y axis of the upper arm (opposite to joint 4's axis), both in the base."""
+        _, a, b, _ = self.lengths
+        (c1, c2, c3), (s1, s2, s3) = np.cos(q[:3]), np.sin(q[:3])
+        x3 = np.array([c1 * c2 * c3 - s1 * s3, s1 * c2 * c3 + c1 * s3, -s2 * c3])
+        y3 = np.array([-c1 * c2 * s3 - s1 * c3, -s1 * c2 * s3 + c1 * c3, s2 * s3])
+        z3 = np.array([c1 * s2, s1 * s2, c2])
+        w = -b * math.sin(q[3]) * x3 + (a + b * math.cos(q[3])) * z3
+        return w / max(float(np.linalg.norm(w)), _ALIGNED), y3
+
+
+def joint_vector(q: ArrayLike) -> Array:
+    """A configuration (7,) as floats; InvalidProblem if the shape is another."""
+    q = np.asarray(q, dtype=float)
+    if q.shape != (7,):
+        raise InvalidProblem(f"a configuration of an S-R-S arm has shape (7,), got {q.shape}")
+    return q
+
+
+def _reference_directions(ux: float, uy: float, uz: float) -> tuple[Array, Array]:
+    """Reference direction e of the arm angle for S–W along u, and g = u × e."""
+    level = math.hypot(ux, uy)
+    if level < VERTICAL:
+        # To first order in the tilt of u: exact in double precision below VERTICAL.
+        return np.array([1.0, 0.0, -ux * uz]), np.array([0.0, uz, -uy])
+    cx, cy = ux / level, uy / level
+    return np.array([-uz * cx, -uz * cy, level]), np.array([cy, -cx, 0.0])
+
+
+def _zyz_angles(R: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Angles (..., 3) of R = Rz Ry Rz, the middle one in [0, π], and where it is 0 or π; R (..., 9) row-major.
+
+    There the first angle is zero and the third takes all of the turn.
+    """
+    tilt = np.hypot(R[..., 2], R[..., 5])
+    aligned = tilt < _ALIGNED
+    first = np.where(aligned, 0.0, np.arctan2(R[..., 5], R[..., 2]))
+    c, s = np.cos(first), np.sin(first)
+    # From the upper two rows instead of the last one, which vanishes with the tilt.
+    third = np.arctan2(c * R[..., 3] - s * R[..., 0], c * R[..., 4] - s * R[..., 1])
+    return np.stack([first, np.arctan2(tilt, R[..., 8]), third], axis=-1), aligned
+
+
+def _share_turns(q: Array, angles: Array, aligned: NDArray[np.bool_]) -> None:
+    """Let the neighbours of an aligned joint share their turn equally, in place; q (m, 7) or (m, 8, 7)."""
+    for part, (first, third) in enumerate(((0, 2), (4, 6))):
+        rows = np.nonzero(aligned[:, part])[0]
+        # At 0 the two neighbours add up, at π they subtract.
+        sign = np.where(angles[rows, part, 1] > 0.5 * math.pi, -1.0, 1.0).reshape(-1, *[1] * (q.ndim - 2))
+        turn = q[rows, ..., third] + sign * q[rows, ..., first]
+        turn -= 2.0 * math.pi * np.rint(turn / (2.0 * math.pi))
+        q[rows, ..., first], q[rows, ..., third] = 0.5 * sign * turn, 0.5 * turn
+
+
+def _euler_rates(first: float, middle: float, omega: Array) -> tuple[Array, float]:
+    """K · rates (3,) of Rz(first) Ry(middle) Rz(third) for angular velocity omega; k ≤ 1 keeps them finite."""
+    c, s = math.cos(first), math.sin(first)
+    along, across = c * omega[0] + s * omega[1], -s * omega[0] + c * omega[1]
+    sine, cosine = math.sin(middle), math.cos(middle)
+    if abs(sine) > _NEARLY_ALIGNED:
+        third, k = along / sine, 1.0
+    elif abs(along) <= ROUNDING:
+        third, k = 0.0, 1.0
+    else:
+        third, k = along, sine
+    return np.array([k * omega[2] - cosine * third, k * across, third]), k
