@@ -10,12 +10,13 @@ Minimum Σ a² under two linear equations is a combination of c and d: two numbe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from dyngrasp.planning.problem import PhaseProblem
-from dyngrasp.signals import Array
+from dyngrasp.signals import Array, read_only
 from dyngrasp.trajectory import Trajectory
 
 # A motion from a state at rest to itself costs least with no duration at all; a trajectory needs one (s).
@@ -28,10 +29,7 @@ def _end_map(intervals: int) -> tuple[Array, Array, Array]:
     h = 1.0 / intervals
     c = np.full(intervals + 1, h)
     c[[0, -1]] = h / 2
-    d = h**2 * np.arange(intervals, -1.0, -1.0)
-    d[0] = h**2 * (intervals / 2 - 0.25)
-    d[-1] = h**2 / 4
-    rows = np.vstack([c, d])
+    rows = np.vstack([c, _reach_row(intervals, intervals)])
     gram = rows @ rows.T
     return rows, gram, np.linalg.inv(gram)
 
@@ -115,15 +113,73 @@ def best_duration(problem: PhaseProblem) -> float:
 
     T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
     """
-    c0, c1, c2 = effort_coefficients(problem)
+    return _best_root(effort_coefficients(problem), problem)[0]
+
+
+def _best_root(coefficients: tuple[float, float, float], problem: PhaseProblem) -> tuple[float, float]:
+    """Duration within its bounds that minimises J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), and J there."""
+    c0, c1, c2 = coefficients
     weight = problem.effort_weight / problem.intervals
     roots = np.roots([1.0, 0.0, -weight * c2, -2 * weight * c1, -3 * weight * c0])
     shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
     # Complex pairs come with their real parts too: J decides, so a candidate too many does no harm.
     candidates = np.clip(np.append(roots.real, [shortest, problem.max_duration]), shortest, problem.max_duration)
-    return float(min(candidates, key=lambda duration: least_cost(problem, duration)))
+    costs = candidates + weight * (c0 / candidates**3 + c1 / candidates**2 + c2 / candidates)
+    best = int(costs.argmin())
+    return float(candidates[best]), float(costs[best])
 
 
 def unconstrained_optimum(problem: PhaseProblem) -> Trajectory:
     """The optimum of the phase without its inequalities; optimal for the phase if it satisfies them."""
     return least_effort(problem, best_duration(problem))
+
+
+def optimum_through(problem: PhaseProblem, nodes: Sequence[int], waypoints: Array) -> tuple[Trajectory, float]:
+    """The cheapest motion that passes given positions at given grid points, without the inequalities.
+
+    Args:
+        problem: Gives the boundary states, ρ and the bounds on the duration.
+        nodes: Inner grid points, ascending, each between 1 and N−1.
+        waypoints: (len(nodes), n) positions there (rad).
+
+    Returns:
+        The motion and its objective (s).
+    """
+    N = problem.intervals
+    rows = np.vstack([_end_map(N)[0], *(_reach_row(N, node)[None] for node in nodes)])
+    gram_inverse = np.linalg.inv(rows @ rows.T)
+    coasted = np.asarray(nodes, dtype=float)[:, None] / N * problem.start_velocity
+
+    def change(duration: float) -> Array:
+        return np.vstack([_end_change(problem, duration), waypoints - problem.start_position - duration * coasted])
+
+    fixed = change(0.0)
+    linear = change(1.0) - fixed
+    products = [np.sum(a * (gram_inverse @ b)) for a, b in ((fixed, fixed), (fixed, linear), (linear, linear))]
+    duration, cost = _best_root((float(products[0]), 2.0 * float(products[1]), float(products[2])), problem)
+    return nearest_trajectory(problem, rows.T @ (gram_inverse @ change(duration)), duration), cost
+
+
+def _reach_row(intervals: int, node: int) -> Array:
+    """(N+1,) what each acceleration adds to the position at a grid point, in normalised time."""
+    h = 1.0 / intervals
+    row = np.zeros(intervals + 1)
+    row[: node + 1] = h**2 * np.arange(node, -1.0, -1.0)
+    row[0] = h**2 * (node / 2 - 0.25)
+    row[node] = h**2 / 4
+    return row
+
+
+@lru_cache(maxsize=64)
+def rest_to_rest(intervals: int) -> tuple[Array, Array, Array]:
+    """Position, rate and curvature, each (N+1,), of the least-effort motion from 0 to 1 at rest, in normalised time."""
+    rows, _, gram_inverse = _end_map(intervals)
+    curvature = rows.T @ (gram_inverse @ np.array([0.0, 1.0]))
+    position, rate = integrate(np.zeros(1), np.zeros(1), curvature[:, None])
+    # The motion is odd about its middle; averaging with its mirror image takes the summed rounding out of both ends.
+    symmetric_rate = (rate[:, 0] + rate[::-1, 0]) / 2
+    symmetric_position = (position[:, 0] + 1.0 - position[::-1, 0]) / 2
+    symmetric_rate[[0, -1]] = 0.0
+    symmetric_position[[0, -1]] = 0.0, 1.0
+    odd_curvature = (curvature - curvature[::-1]) / 2
+    return read_only(symmetric_position), read_only(symmetric_rate), read_only(odd_curvature)

@@ -129,6 +129,8 @@ class IpoptSolver:
                     "max_wall_time": settings.time_limit,
                     "tol": settings.tolerance,
                     "mu_init": settings.initial_barrier,
+                    # Rows come scaled by `NodeConstraint.scale`; IPOPT's own rule looks at the first gradients alone.
+                    "nlp_scaling_method": "none",
                 },
             }
             self._solvers[key] = program, ca.nlpsol("phase", "ipopt", program.problem, options)

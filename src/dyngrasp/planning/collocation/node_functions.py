@@ -1,0 +1,213 @@
+"""Rows of a `NodeConstraint`, their Jacobian and the Hessian of their weighted sum at all grid points, as compiled code.
+
+The derivatives are taken symbolically of one grid point; the C code that CasADi makes of them is compiled once for each arm
+and row and runs over the grid in a loop. Without a C compiler CasADi's virtual machine evaluates the same expressions.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+
+from dyngrasp.planning.collocation import code_cache
+from dyngrasp.planning.problem import NodeConstraint
+from dyngrasp.signals import Array
+
+_log = logging.getLogger(__name__)
+
+
+class NodeFunctions(Protocol):
+    """Evaluation of one kind of row over a grid of K points; `columns` places m rows among those of other constraints.
+
+    Attributes:
+        rows: m.
+        compiled: Whether machine code evaluates them.
+        depends_on_acceleration: (m,) whether a row depends on v at all.
+    """
+
+    rows: int
+    compiled: bool
+    depends_on_acceleration: Array
+
+    def values(self, q: Array, v: Array, p: Array, g: Array, column: int) -> None:
+        """Write g (K, total) in columns `column` to `column + m`.
+
+        Args:
+            q, v: (K, n) positions and accelerations, contiguous.
+            p: (K, n_p) parameters.
+            g: (K, total) rows of all constraints.
+            column: Where the rows of this one begin.
+        """
+        ...
+
+    def derivatives(
+        self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
+    ) -> None:
+        """Write values and Jacobian, add the Hessian of Σ weights · g by (q, v).
+
+        Args:
+            q, v, p, g, column: As for `values`.
+            weights: (K, total).
+            jacobian: (K, total, 2n).
+            hessian: (K, 2n, 2n), added to.
+        """
+        ...
+
+
+def node_functions(constraint: NodeConstraint) -> NodeFunctions:
+    """The fastest evaluation that this machine offers; made once for each function of a process."""
+    function = constraint.function
+    command = code_cache.compiler()
+    key = (function.__hash__(), command)
+    if key not in _made:
+        made: NodeFunctions
+        try:
+            made = CompiledNodeFunctions(function, constraint.name)
+        except code_cache.CompilationError as error:
+            _log.warning("%s of the planner run in CasADi's virtual machine, slower: %s", constraint.name, error)
+            made = InterpretedNodeFunctions(function)
+        # A hash is only good as long as the function that it names is alive, hence the function beside it.
+        _made[key] = (function, made)
+    return _made[key][1]
+
+
+_made: dict[tuple, tuple[ca.Function, NodeFunctions]] = {}
+
+
+def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, Array]:
+    """(q, v, p) → g and (q, v, p, weights) → g, Jacobian, Hessian, and which rows depend on v.
+
+    CasADi stores columns; a matrix that shall lie in rows is handed out transposed.
+    """
+    n, m = function.size1_in(0), function.size1_out(0)
+    q, v, p = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("p", function.size1_in(2))
+    weights = ca.SX.sym("weights", m)
+    u = ca.vertcat(q, v)
+    g = ca.densify(function(q, v, p))
+    jacobian = ca.jacobian(g, u)
+    hessian, _ = ca.hessian(ca.dot(weights, g), u)
+    options = {"cse": True}
+    values = ca.Function("values", [q, v, p], [g], options)
+    derivatives = ca.Function(
+        "derivatives", [q, v, p, weights], [g, ca.densify(jacobian.T), ca.densify(hessian)], options
+    )
+    by_acceleration = np.array(ca.DM(function.jac_sparsity(0, 1), 1.0)).reshape(m, n)
+    return values, derivatives, by_acceleration.any(axis=1)
+
+
+class InterpretedNodeFunctions:
+    """CasADi's virtual machine, one call for the whole grid."""
+
+    compiled = False
+
+    def __init__(self, function: ca.Function) -> None:
+        self._values, self._derivatives, self.depends_on_acceleration = _expressions(function)
+        self.rows = function.size1_out(0)
+        self._maps: dict[int, tuple[ca.Function, ca.Function]] = {}
+
+    def _over(self, points: int) -> tuple[ca.Function, ca.Function]:
+        if points not in self._maps:
+            self._maps[points] = self._values.map(points), self._derivatives.map(points)
+        return self._maps[points]
+
+    def values(self, q: Array, v: Array, p: Array, g: Array, column: int) -> None:
+        """See `NodeFunctions`."""
+        g[:, column : column + self.rows] = self._over(len(q))[0](q.T, v.T, p.T).full().T
+
+    def derivatives(
+        self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
+    ) -> None:
+        """See `NodeFunctions`."""
+        K, n = q.shape
+        here = slice(column, column + self.rows)
+        values, rows, curvature = self._over(K)[1](q.T, v.T, p.T, weights[:, here].T)
+        g[:, here] = values.full().T
+        # The map sets K matrices side by side; each column of one is a row of the transpose.
+        jacobian[:, here] = rows.full().T.reshape(K, self.rows, 2 * n)
+        hessian += curvature.full().T.reshape(K, 2 * n, 2 * n)
+
+
+class CompiledNodeFunctions:
+    """Machine code from the cache.
+
+    Raises:
+        CompilationError: There is no compiler, or it failed.
+    """
+
+    compiled = True
+
+    def __init__(self, function: ca.Function, name: str) -> None:
+        values, derivatives, self.depends_on_acceleration = _expressions(function)
+        self.rows = function.size1_out(0)
+        library = code_cache.load(
+            _source(values, derivatives), f"node functions '{name}' of an arm of {function.size1_in(0)} joints"
+        )
+        pointer, number = ctypes.c_void_p, ctypes.c_longlong
+        self._values, self._derivatives = library.values_over_grid, library.derivatives_over_grid
+        self._values.argtypes = [number] + 4 * [pointer] + [number]
+        self._derivatives.argtypes = [number] + 7 * [pointer] + [number]
+        self._values.restype = self._derivatives.restype = None
+
+    def values(self, q: Array, v: Array, p: Array, g: Array, column: int) -> None:
+        """See `NodeFunctions`."""
+        total = g.shape[1]
+        self._values(len(q), q.ctypes.data, v.ctypes.data, p.ctypes.data, g.ctypes.data + 8 * column, total)
+
+    def derivatives(
+        self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
+    ) -> None:
+        """See `NodeFunctions`."""
+        total = g.shape[1]
+        self._derivatives(
+            len(q),
+            q.ctypes.data,
+            v.ctypes.data,
+            p.ctypes.data,
+            weights.ctypes.data + 8 * column,
+            g.ctypes.data + 8 * column,
+            jacobian.ctypes.data + 8 * column * jacobian.shape[2],
+            hessian.ctypes.data,
+            total,
+        )
+
+
+_LOOPS = """
+void values_over_grid(long long points, const double* q, const double* v, const double* p, double* g, long long total) {{
+  double w[{work_values} + 1];
+  long long iw[{integers_values} + 1];
+  for (long long k = 0; k < points; ++k) {{
+    const double* in[{arguments_values}] = {{q + k * {n}, v + k * {n}, p + k * {n_p}}};
+    double* out[{results_values}] = {{g + k * total}};
+    values(in, out, iw, w, 0);
+  }}
+}}
+
+void derivatives_over_grid(long long points, const double* q, const double* v, const double* p, const double* weights,
+                           double* g, double* jacobian, double* hessian, long long total) {{
+  double w[{work_derivatives} + 1];
+  double curvature[{square}];
+  long long iw[{integers_derivatives} + 1];
+  for (long long k = 0; k < points; ++k) {{
+    const double* in[{arguments_derivatives}] = {{q + k * {n}, v + k * {n}, p + k * {n_p}, weights + k * total}};
+    double* out[{results_derivatives}] = {{g + k * total, jacobian + k * total * {twice}, curvature}};
+    derivatives(in, out, iw, w, 0);
+    for (int i = 0; i < {square}; ++i) hessian[k * {square} + i] += curvature[i];
+  }}
+}}
+"""
+
+
+def _source(values: ca.Function, derivatives: ca.Function) -> str:
+    generator = ca.CodeGenerator("node", {"with_header": False})
+    sizes = {"n": values.size1_in(0), "n_p": values.size1_in(2), "twice": 2 * values.size1_in(0)}
+    sizes["square"] = sizes["twice"] ** 2
+    for function in (values, derivatives):
+        generator.add(function)
+        name = function.name()
+        sizes |= {f"work_{name}": function.sz_w(), f"integers_{name}": function.sz_iw()}
+        sizes |= {f"arguments_{name}": function.sz_arg(), f"results_{name}": function.sz_res()}
+    return generator.dump() + _LOOPS.format(**sizes)

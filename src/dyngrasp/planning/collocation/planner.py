@@ -1,0 +1,279 @@
+"""The offline planner: three phases of arm and hand on one clock, from boundary states to an audited plan."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.errors import InvalidProblem, OutOfReach
+from dyngrasp.models.inverse_kinematics import inverse_kinematics_for
+from dyngrasp.planning import constraints
+from dyngrasp.planning.audit import audit
+from dyngrasp.planning.collocation.closed_form import optimum_through
+from dyngrasp.planning.collocation.gripper_path import GripperPath, gripper_path
+from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
+from dyngrasp.planning.collocation.residuals import rows
+from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask
+from dyngrasp.planning.problem import NodeConstraint, PhaseProblem, PhaseSolver, PlanResult, Solution, Status
+from dyngrasp.signals import Array, JointState
+from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
+
+
+@dataclass(frozen=True)
+class CollocationSettings:
+    """Settings of `CollocationPlanner`.
+
+    Attributes:
+        effort_weight: ρ of eq. (3a) (s⁴/rad²): 1 is the paper's, 1e-3 close to time-optimal.
+        intervals: N of each phase.
+        backend: Name of the solver of one phase; see `BACKENDS`.
+        velocity_fraction, torque_fraction: Parts of the limits that a plan may use; the rest serves the controller,
+            which has to track the plan with a model that is not exact.
+        position_margin: Distance kept from the position limits (rad), less where a boundary state is closer.
+        funnel_margin: h ≥ this at the grid points of the approach (m), because between them the hand cuts corners.
+        hold_safety: Factor by which the pinch exceeds what the part asks of it while it is carried.
+        max_duration: Longest approach and longest delivery (s).
+    """
+
+    effort_weight: float = 1.0
+    intervals: int = 100
+    backend: str = "ipopt"
+    velocity_fraction: float = 0.95
+    torque_fraction: float = 0.9
+    position_margin: float = 0.01
+    funnel_margin: float = 0.002
+    hold_safety: float = 1.5
+    max_duration: float = 30.0
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_fraction", "torque_fraction"):
+            if not 0 < getattr(self, name) <= 1:
+                raise InvalidProblem(f"{name} must be in (0, 1], got {getattr(self, name)}")
+        if self.backend not in BACKENDS:
+            raise InvalidProblem(f"no backend called {self.backend!r}; valid: {', '.join(sorted(BACKENDS))}")
+
+
+BACKENDS = {"ipopt": lambda: IpoptSolver(IpoptSettings())}
+"""Solvers of one phase by name."""
+
+# Heights of the way points, in parts of z_th above the pre-grasp's own, and when they are passed, in parts of the descent.
+_DESCENT_HEIGHTS = np.array([1.0, 0.62, 0.25])
+
+# Parts of the approach that the descent through the funnel may take; the cheapest of them is the start.
+_DESCENT_SHARES = np.linspace(0.06, 0.5, 12)
+
+
+class CollocationPlanner:
+    """Plans a grasp by trapezoidal collocation with free phase durations, eq. (3)."""
+
+    def __init__(
+        self, task: GraspTask, settings: CollocationSettings | None = None, solver: PhaseSolver | None = None
+    ) -> None:
+        """Prepare a planner; functions are built at the first plan and kept.
+
+        Args:
+            task: Arm, gripper, part and target.
+            settings: How to plan.
+            solver: Used in place of the backend that the settings name.
+        """
+        self.task = task
+        self.settings = settings or CollocationSettings()
+        self.solver = solver or BACKENDS[self.settings.backend]()
+
+    def plan(
+        self,
+        q_start: Array | JointState,
+        targets: GraspTargets,
+        gripper_start: Array | None = None,
+        start_time: float = 0.0,
+    ) -> PlanResult:
+        """Plan the three phases one after the other, and audit the whole.
+
+        Args:
+            q_start: (n,) configuration at rest (rad), or a state with its velocity.
+            targets: Boundary states of the phases.
+            gripper_start: (m,) present posture of the gripper (rad), at rest; open if left out.
+            start_time: Time of the first grid point on the common clock (s).
+
+        Returns:
+            The plan if every phase converged and the audit passed; else what went wrong, as a status.
+        """
+        began = time.perf_counter()
+        paths = self._gripper_paths(targets, gripper_start)
+        problems = self.phase_problems(q_start, targets, gripper_start)
+        timings = {"problems": 1e3 * (time.perf_counter() - began)}
+        solutions: list[Solution] = []
+        for name, problem in zip(PHASE_NAMES, problems, strict=True):
+            solution = self.solver.solve(problem, self.guess(problem, targets))
+            solutions.append(solution)
+            timings[name] = solution.timings_ms.get("total", 0.0)
+            if not solution.ok:
+                timings["total"] = 1e3 * (time.perf_counter() - began)
+                return PlanResult(solution.status, None, tuple(solutions), None, timings, solution.message)
+        arm = tuple(solution.require() for solution in solutions)
+        plan = GraspPlan(
+            arm=arm,  # type: ignore[arg-type]
+            gripper=tuple(path.over(phase.duration) for path, phase in zip(paths, arm, strict=True)),  # type: ignore[arg-type]
+            start_time=start_time,
+            arm_joints=self.task.robot.joint_names,
+            gripper_joints=self.task.gripper.joint_names,
+        )
+        audited = time.perf_counter()
+        report = audit(plan, targets, self.task)
+        timings["audit"] = 1e3 * (time.perf_counter() - audited)
+        timings["total"] = 1e3 * (time.perf_counter() - began)
+        if report.ok:
+            return PlanResult(Status.CONVERGED, plan, tuple(solutions), report, timings)
+        failed = "; ".join(str(entry) for entry in report.entries if not entry.ok)
+        return PlanResult(Status.AUDIT_FAILED, plan, tuple(solutions), report, timings, f"audit: {failed}")
+
+    def phase_problems(
+        self, q_start: Array | JointState, targets: GraspTargets, gripper_start: Array | None = None
+    ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
+        """The three problems that `plan` solves, in the order of `PHASE_NAMES`; arguments as there."""
+        task, settings = self.task, self.settings
+        start = _state(q_start)
+        paths = self._gripper_paths(targets, gripper_start)
+        bounds = [path.shortest_duration(task.gripper.velocity, task.gripper.acceleration) for path in paths]
+        empty, loaded = task.robot_empty, task.robot_loaded(targets.grasp)
+        torque = constraints.torque_rows(empty, settings.intervals, settings.torque_fraction)
+        approach = self._phase("approach", start, targets.pregrasp, (torque,), bounds[0], settings.max_duration)
+        approach = replace(approach, constraints=(torque, self._funnel(approach, targets, paths[0])))
+        longest = task.settings.grasp_duration_max
+        if bounds[1] > longest:
+            raise InvalidProblem(
+                f"grasp: {task.gripper.name} needs {bounds[1]:.3f} s to close, grasp_duration_max is {longest:g} s"
+            )
+        grasp = self._phase(
+            "grasp",
+            targets.pregrasp,
+            targets.grasped,
+            (torque, self._tube(targets, paths[1])),
+            max(bounds[1], task.settings.grasp_duration_min),
+            longest,
+        )
+        carry = (constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction), self._hold(targets))
+        deliver = self._phase("deliver", targets.grasped, targets.place, carry, 0.0, settings.max_duration)
+        return approach, grasp, deliver
+
+    def guess(self, problem: PhaseProblem, targets: GraspTargets) -> Trajectory | None:
+        """A start for the approach that comes down the funnel; None where the solver's own start is as good.
+
+        The hand is sent through way points on the grasp axis; of several times for the descent the cheapest is taken.
+        """
+        funnels = [constraint for constraint in problem.constraints if constraint.name == "funnel"]
+        if not funnels:
+            return None
+        task = self.task
+        T_hand_grasp = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_open)
+        lowest, top = task.settings.pregrasp_distance, task.grasp_object.funnel.z_threshold
+        if top <= lowest:
+            return None
+        kinematics = inverse_kinematics_for(task.robot)
+        waypoints = []
+        q = problem.end_position
+        try:
+            for height in lowest + (top - lowest) * _DESCENT_HEIGHTS[::-1]:
+                above = targets.T_world_grasp * pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
+                q = kinematics.nearest(above * T_hand_grasp.inverse(), q)
+                waypoints.insert(0, q)
+        except OutOfReach:
+            return None
+        best: tuple[Trajectory, float] | None = None
+        for share in _DESCENT_SHARES:
+            # Square roots: the descent brakes towards the pre-grasp.
+            nodes = np.round(problem.intervals * (1 - share * np.sqrt(_DESCENT_HEIGHTS))).astype(int)
+            if np.unique(nodes).size < nodes.size or nodes[0] < 1 or nodes[-1] >= problem.intervals:
+                continue
+            found = optimum_through(problem, nodes.tolist(), np.array(waypoints))
+            if best is None or found[1] < best[1]:
+                best = found
+        return None if best is None else best[0]
+
+    def _phase(
+        self,
+        name: str,
+        start: BoundaryState,
+        end: BoundaryState,
+        rows: tuple[NodeConstraint, ...],
+        shortest: float,
+        longest: float,
+    ) -> PhaseProblem:
+        settings, limits = self.settings, self.task.robot.limits
+        inner_lower = limits.position_lower + settings.position_margin
+        inner_upper = limits.position_upper - settings.position_margin
+        lowest, highest = np.minimum(start.position, end.position), np.maximum(start.position, end.position)
+        return PhaseProblem(
+            name=name,
+            start_position=start.position,
+            start_velocity=start.velocity,
+            end_position=end.position,
+            end_velocity=end.velocity,
+            position_lower=np.maximum(np.minimum(inner_lower, lowest), limits.position_lower),
+            position_upper=np.minimum(np.maximum(inner_upper, highest), limits.position_upper),
+            velocity_limit=settings.velocity_fraction * limits.velocity,
+            acceleration_limit=limits.acceleration,
+            constraints=rows,
+            intervals=settings.intervals,
+            effort_weight=settings.effort_weight,
+            min_duration=shortest,
+            max_duration=longest,
+        )
+
+    def _gripper_paths(self, targets: GraspTargets, gripper_start: Array | None) -> tuple[GripperPath, ...]:
+        start = targets.gripper_open if gripper_start is None else np.asarray(gripper_start, dtype=float)
+        postures = (start, targets.gripper_open, targets.gripper_closed, targets.gripper_closed)
+        return tuple(gripper_path(postures[i], postures[i + 1], self.settings.intervals) for i in range(3))
+
+    def _grasp_points(self, path: GripperPath) -> Array:
+        """(N+1, 3) G in the flange frame along the hand's motion (m)."""
+        gripper = self.task.gripper
+        T = gripper.T_flange_hand
+        return gripper.grasp_point_many(path.position) @ T.rotation.T + T.translation
+
+    def _funnel(self, problem: PhaseProblem, targets: GraspTargets, path: GripperPath) -> NodeConstraint:
+        """The funnel with its margin, or with what the boundary states leave of it."""
+        funnel = constraints.funnel(
+            self.task.robot, self._grasp_points(path), targets.T_world_grasp, self.task.grasp_object.funnel
+        )
+        ends = np.vstack([problem.start_position, problem.end_position])
+        at_ends = replace(funnel, parameters=funnel.parameters[[0, -1]])
+        # A little less than the ends have, so that an interior point remains.
+        margin = min(self.settings.funnel_margin, 0.9 * float(rows(at_ends, ends, np.zeros_like(ends)).min()))
+        return replace(funnel, lower=np.array([max(margin, 0.0)]))
+
+    def _tube(self, targets: GraspTargets, path: GripperPath) -> NodeConstraint:
+        gripper, settings = self.task.gripper, self.task.settings
+        T_flange_grasp = gripper.T_flange_hand * gripper.T_hand_grasp(targets.gripper_closed)
+        return constraints.grasp_tube(
+            self.task.robot,
+            self._grasp_points(path),
+            T_flange_grasp.rotation,
+            targets.T_world_grasp,
+            settings.lateral_tolerance,
+            settings.dip_tolerance,
+            settings.tilt_tolerance,
+        )
+
+    def _hold(self, targets: GraspTargets) -> NodeConstraint:
+        task = self.task
+        T_flange_grasp = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_closed)
+        T_flange_object = T_flange_grasp * targets.grasp.T_object_grasp.inverse()
+        return constraints.hold(
+            task.robot,
+            T_flange_object.act(task.grasp_object.spatial_inertia),
+            T_flange_grasp,
+            task.grasp_object.friction,
+            task.gripper.pinch_force,
+            self.settings.intervals,
+            self.settings.hold_safety,
+        )
+
+
+def _state(q_start: Array | JointState) -> BoundaryState:
+    if isinstance(q_start, JointState):
+        return BoundaryState(q_start.position, q_start.velocity)
+    return BoundaryState(q_start, np.zeros(np.size(q_start)))

@@ -1,0 +1,257 @@
+"""The constraints of the three phases, each written once as a symbolic function of one grid point.
+
+Whatever a pose, a part or a gripper changes is a parameter: one function serves an arm for good, so that derivatives and
+compiled code are made once. Functions are kept in `RobotModel.symbolic_cache`, which copies with other payloads share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from dyngrasp.errors import GraspRefused, InvalidProblem
+from dyngrasp.models import symbolic
+from dyngrasp.models.robot import RobotModel
+from dyngrasp.planning.problem import NodeConstraint
+from dyngrasp.signals import Array
+
+if TYPE_CHECKING:
+    from dyngrasp.models.grasp_object import Friction, Funnel
+
+
+def torque_rows(robot: RobotModel, intervals: int, fraction: float = 1.0) -> NodeConstraint:
+    """∓(fraction · τmax − c) around M(q) v + g(q), eq. (3e): the Coriolis torque is not in the row, its bound c is.
+
+    Args:
+        robot: The arm with what it carries as its payload.
+        intervals: N.
+        fraction: Part of the torque limits to use; what is left serves the controller.
+
+    Raises:
+        InvalidProblem: Nothing is left of a limit after the bound.
+    """
+    bound = fraction * robot.limits.torque - robot.limits.coriolis
+    if not (bound > 0).all():
+        i = int(bound.argmin())
+        raise InvalidProblem(
+            f"{fraction:g} of the torque limit {robot.limits.torque[i]:g} Nm of {robot.joint_names[i]} is less than the bound "
+            f"of its Coriolis torque, {robot.limits.coriolis[i]:g} Nm"
+        )
+    payload = _at_each(symbolic.payload_vector(robot.payload), intervals)
+    return NodeConstraint("torque", symbolic.torque(robot), payload, -bound, bound, robot.limits.torque)
+
+
+def funnel(
+    robot: RobotModel, p_flange_grasp: ArrayLike, T_world_grasp: pin.SE3, shape: Funnel, margin: float = 0.0
+) -> NodeConstraint:
+    """G stays above the inverted Gaussian, eqs. (6) and (7): h = z − z_th (1 − exp(−½ (x²/σx² + y²/σy²))) ≥ 0.
+
+    Above z_th it holds by itself, so that one row serves the whole approach. Equivalent rows with a gentler wall (h over
+    the length of its gradient, logarithms) converge worse, see decision 0003; what h needs is a start that
+    already comes down the funnel.
+
+    Args:
+        robot: The arm.
+        p_flange_grasp: (N+1, 3) G in the flange frame at each grid point (m).
+        T_world_grasp: The grasp frame, z outward along the approach axis.
+        shape: z_th, σx, σy (m).
+        margin: h ≥ margin at the grid points (m), for what happens between them.
+    """
+    points = _points(p_flange_grasp)
+    frame = np.concatenate([_frame(T_world_grasp), [shape.z_threshold, shape.sigma_x, shape.sigma_y]])
+    parameters = np.hstack([points, np.tile(frame, (len(points), 1))])
+
+    def build() -> ca.Function:
+        q, v, p = _inputs(robot, 18)
+        G, _, _ = _in_grasp_frame(robot, q, p[:3], p[3:15])
+        height, sigma_x, sigma_y = p[15], p[16], p[17]
+        h = G[2] - height * (1 - ca.exp(-((G[0] / sigma_x) ** 2 + (G[1] / sigma_y) ** 2) / 2))
+        return ca.Function("funnel", [q, v, p], [h], ["q", "v", "p"], ["g"])
+
+    function = _cached(robot, "funnel", build)
+    return NodeConstraint("funnel", function, parameters, [margin], [np.inf], [shape.z_threshold])
+
+
+def grasp_tube(
+    robot: RobotModel,
+    p_flange_grasp: ArrayLike,
+    R_flange_grasp: ArrayLike,
+    T_world_grasp: pin.SE3,
+    lateral: float = 0.0015,
+    dip: float = 0.003,
+    tilt: float = np.deg2rad(1.0),
+) -> NodeConstraint:
+    """While the hand closes, G stays on the grasp axis and the hand in its orientation.
+
+    Rows: x² + y² ≤ lateral² and z ≥ −dip of G in the grasp frame, and 3 − trace(R) = 4 sin²(θ/2) for the angle θ between
+    the hand and the grasp frame. The squares are smooth on the axis itself, where the motion begins and ends.
+
+    Args:
+        robot: The arm.
+        p_flange_grasp: (N+1, 3) G in the flange frame (m): it moves as the fingers close.
+        R_flange_grasp: (3, 3) axes of the hand's grasp frame in the flange frame.
+        T_world_grasp: The grasp frame.
+        lateral, dip: Distances (m), > 0.
+        tilt: Angle (rad), > 0.
+    """
+    points = _points(p_flange_grasp)
+    fixed = np.concatenate([np.asarray(R_flange_grasp, dtype=float).ravel(), _frame(T_world_grasp)])
+    parameters = np.hstack([points, np.tile(fixed, (len(points), 1))])
+
+    def build() -> ca.Function:
+        q, v, p = _inputs(robot, 24)
+        G, R, R_world_grasp = _in_grasp_frame(robot, q, p[:3], p[12:24])
+        hand = R @ _matrix(p[3:12])
+        rows = ca.vertcat(G[0] ** 2 + G[1] ** 2, G[2], 3 - ca.sum1(ca.sum2(R_world_grasp * hand)))
+        return ca.Function("grasp_tube", [q, v, p], [rows], ["q", "v", "p"], ["g"])
+
+    function = _cached(robot, "grasp_tube", build)
+    twist = 4 * np.sin(tilt / 2) ** 2
+    return NodeConstraint(
+        "grasp_tube",
+        function,
+        parameters,
+        [-np.inf, -dip, -np.inf],
+        [lateral**2, np.inf, twist],
+        [lateral**2, dip, twist],
+    )
+
+
+def hold(
+    robot: RobotModel,
+    part: pin.Inertia,
+    T_flange_grasp: pin.SE3,
+    friction: Friction,
+    pinch_force: float,
+    intervals: int,
+    safety: float = 1.5,
+    closing_share: float = 0.5,
+) -> NodeConstraint:
+    """The pinch carries the part: friction and torsion of two pads under the part's acceleration.
+
+    The wrench that the part needs at G is taken with q̇ = 0, as in the torque rows. Its force f_t in the plane across the
+    closing axis and its moment m_n about that axis stay within the ellipse
+    (f_t / (2 μ N))² + (m_n / (2 t N))² ≤ 1 / safety², a convex approximation of the limit surface of two pads that press
+    with N each. Along the closing axis the force only shifts load between the pads: |f_y| ≤ closing_share · N. Moments
+    across the closing axis are left to the width of the pads.
+
+    Args:
+        robot: The arm.
+        part: Inertia of the part in the flange frame.
+        T_flange_grasp: The grasp frame in the flange frame as the closed hand holds it, y along the closing axis.
+        friction: Sliding coefficient μ and torsional coefficient t (m).
+        pinch_force: N of one finger (N).
+        intervals: N of the grid.
+        safety: ≥ 1.
+        closing_share: Part of N that acceleration may add to or take from one pad, in (0, 1).
+    """
+    if safety < 1 or not 0 < closing_share < 1:
+        raise InvalidProblem(f"safety must be ≥ 1 and the closing share in (0, 1); got {safety}, {closing_share}")
+    numbers = np.concatenate(
+        [
+            symbolic.payload_vector(part),
+            T_flange_grasp.translation,
+            T_flange_grasp.rotation[:, 1],
+            _inverse_capacities(friction, pinch_force),
+        ]
+    )
+
+    def build() -> ca.Function:
+        q, v, p = _inputs(robot, 19)
+        force, moment = _part_wrench(robot, q, v, p[:10], p[10:13])
+        axis = p[13:16]
+        along = ca.dot(axis, force)
+        tangential = p[16] ** 2 * ca.sumsqr(force - along * axis)
+        rows = ca.vertcat(tangential + (p[17] * ca.dot(axis, moment)) ** 2, p[18] * along)
+        return ca.Function("hold", [q, v, p], [rows], ["q", "v", "p"], ["g"])
+
+    function = _cached(robot, "hold", build)
+    limit = 1 / safety**2
+    parameters = _at_each(numbers, intervals)
+    return NodeConstraint(
+        "hold", function, parameters, [-np.inf, -closing_share], [limit, closing_share], [limit, closing_share]
+    )
+
+
+def holding_margin(part: pin.Inertia, T_world_grasp: pin.SE3, friction: Friction, pinch_force: float) -> float:
+    """By what factor the pinch exceeds what the part's weight asks of it, at rest.
+
+    Args:
+        part: Inertia of the part in the grasp frame.
+        T_world_grasp: The grasp frame, y along the closing axis.
+        friction, pinch_force: As in `hold`.
+
+    Raises:
+        GraspRefused: 2 t N < 2 m g d with d the lever of the weight about the closing axis: the part would turn in the
+            hand at the slightest acceleration.
+    """
+    weight = T_world_grasp.rotation.T @ np.array([0.0, 0.0, part.mass * pin.Model.gravity981[2]])
+    moment = float(np.cross(part.lever, weight)[1])
+    capacity = 2 * friction.torsional * pinch_force
+    if capacity < 2 * abs(moment):
+        raise GraspRefused(
+            f"the pinch holds {capacity:.3f} Nm of torsion; the part's weight asks {abs(moment):.3f} Nm about the closing "
+            f"axis, and twice that is needed"
+        )
+    slip, twist, _ = _inverse_capacities(friction, pinch_force)
+    return float(1 / np.hypot(slip * np.hypot(weight[0], weight[2]), twist * moment))
+
+
+def _inverse_capacities(friction: Friction, pinch_force: float) -> Array:
+    return 1 / (pinch_force * np.array([2 * friction.sliding, 2 * friction.torsional, 1.0]))
+
+
+def _part_wrench(robot: RobotModel, q: ca.SX, v: ca.SX, part: ca.SX, p_G: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Force and moment about G, in flange axes, that the hand exerts on the part for q̈ = v at q̇ = 0."""
+    R, p = symbolic.flange_pose(robot)(q)
+    gravity = ca.DM(robot.pin_model.gravity.linear)
+    a = R.T @ (ca.jtimes(p, q, v) - gravity)
+    spin = R.T @ ca.reshape(ca.jtimes(ca.vec(R), q, v), 3, 3)
+    alpha = ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
+    m, mc = part[0], part[1:4]
+    xx, xy, yy, xz, yz, zz = ca.vertsplit(part[4:10])
+    inertia = ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz))
+    force = m * a + ca.cross(alpha, mc)
+    return force, inertia @ alpha + ca.cross(mc, a) - ca.cross(p_G, force)
+
+
+def _in_grasp_frame(robot: RobotModel, q: ca.SX, p_G: ca.SX, frame: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """G in the grasp frame, the flange's rotation and the grasp frame's, both in the world."""
+    R, p = symbolic.flange_pose(robot)(q)
+    R_world_grasp, t = _matrix(frame[:9]), frame[9:12]
+    return R_world_grasp.T @ (p + R @ p_G - t), R, R_world_grasp
+
+
+def _cached(robot: RobotModel, name: str, build: Callable[[], ca.Function]) -> ca.Function:
+    key = f"planning.{name}"
+    if key not in robot.symbolic_cache:
+        robot.symbolic_cache[key] = build()
+    return robot.symbolic_cache[key]
+
+
+def _inputs(robot: RobotModel, parameters: int) -> tuple[ca.SX, ca.SX, ca.SX]:
+    return ca.SX.sym("q", robot.n), ca.SX.sym("v", robot.n), ca.SX.sym("p", parameters)
+
+
+def _matrix(row_major: ca.SX) -> ca.SX:
+    return ca.reshape(row_major, 3, 3).T
+
+
+def _frame(T: pin.SE3) -> Array:
+    return np.concatenate([T.rotation.ravel(), T.translation])
+
+
+def _points(p_flange_grasp: ArrayLike) -> Array:
+    points = np.asarray(p_flange_grasp, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InvalidProblem(f"one point of three coordinates for each grid point expected, got shape {points.shape}")
+    return points
+
+
+def _at_each(numbers: Array, intervals: int) -> Array:
+    return np.tile(numbers, (intervals + 1, 1))
