@@ -10,7 +10,7 @@ import numpy as np
 
 from dyngrasp.planning.collocation import transcription
 from dyngrasp.planning.collocation.closed_form import nearest_trajectory, unconstrained_optimum
-from dyngrasp.planning.collocation.residuals import objective, violated_at_the_ends, worst_violation
+from dyngrasp.planning.collocation.residuals import infeasible_at_once, objective, worst_violation
 from dyngrasp.planning.problem import PhaseProblem, Solution, Status
 from dyngrasp.trajectory import Trajectory
 
@@ -74,12 +74,10 @@ class IpoptSolver:
         """
         clock = time.perf_counter
         began = clock()
-        name = violated_at_the_ends(problem, self.settings.violation_tolerance)
-        if name:
+        reason = infeasible_at_once(problem, self.settings.violation_tolerance)
+        if reason:
             timings = {"total": 1e3 * (clock() - began)}
-            return Solution(
-                Status.INFEASIBLE, None, np.nan, 0, np.inf, timings, f"{problem.name}: {name} is violated at a boundary"
-            )
+            return Solution(Status.INFEASIBLE, None, np.nan, 0, np.inf, timings, f"{problem.name}: {reason}")
         start = unconstrained_optimum(problem) if guess is None else _on_grid(problem, guess)
         guessed = clock()
         nlp = self._solver(problem)
@@ -121,6 +119,7 @@ class IpoptSolver:
                 "error_on_fail": False,
                 "print_time": False,
                 "show_eval_warnings": False,
+                "calc_lam_p": False,
                 "ipopt": {
                     "print_level": 0,
                     "sb": "yes",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -60,20 +62,26 @@ def worst_violation(problem: PhaseProblem, trajectory: Trajectory) -> tuple[floa
     return (float(found[name]), name) if found[name] > 0 else (0.0, "")
 
 
-def violated_at_the_ends(problem: PhaseProblem, tolerance: float) -> str:
-    """The name of a constraint that a boundary position violates whatever the motion; "" if there is none."""
+def infeasible_at_once(problem: PhaseProblem, tolerance: float) -> str:
+    """Why no motion can solve the problem, as far as that shows without a search; "" if it does not show.
+
+    A joint at top speed must cover its way in the longest duration, and rows that no acceleration enters must hold
+    at the boundary positions, where nothing is left to choose.
+    """
+    travel = np.abs(problem.end_position - problem.start_position) / problem.velocity_limit
+    joint = int(travel.argmax())
+    if travel[joint] > problem.max_duration * (1 + tolerance):
+        return (
+            f"joint {joint + 1} needs {travel[joint]:.3f} s at its top speed, "
+            f"the longest duration is {problem.max_duration:.3f} s"
+        )
     ends = np.vstack([problem.start_position, problem.end_position])
     for constraint in problem.constraints:
         if constraint.function.jac_sparsity(0, 1).nnz() > 0:
             continue
-        at_ends = NodeConstraint(
-            constraint.name,
-            constraint.function,
-            constraint.parameters[[0, -1]],
-            constraint.lower,
-            constraint.upper,
-            constraint.scale,
-        )
-        if excess(constraint, rows(at_ends, ends, np.zeros_like(ends))).max() > tolerance:
-            return constraint.name
+        at_ends = replace(constraint, parameters=constraint.parameters[[0, -1]])
+        outside = excess(constraint, rows(at_ends, ends, np.zeros_like(ends))).max(axis=1)
+        for end, by in zip(("start", "end"), outside, strict=True):
+            if by > tolerance:
+                return f"{constraint.name} is violated at the {end} by {by:.1e} of its scale"
     return ""

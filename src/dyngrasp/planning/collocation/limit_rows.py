@@ -1,0 +1,264 @@
+"""All limits of a phase as one-sided rows g(x, T) ≥ 0, and their products with vectors.
+
+Rows of one grid point, in units of their own scale:
+
+    (q − q_min) / half-width,   (q_max − q) / half-width,      n each
+    T + w / q̇_max,              T − w / q̇_max,                 n each
+    T² + a / v_max,             T² − a / v_max,                n each, only if some v_max is finite
+    (c − lower) / scale,        (upper − c) / scale            of the constraints' rows c(q, v), v = a / T²
+
+and after the last grid point the two bounds of T. The boundary states make some rows at both ends constant; they are
+checked beforehand and stand here as the constant 1, which an interior point method does not notice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from dyngrasp.planning.collocation.closed_form import SHORTEST_DURATION
+from dyngrasp.planning.collocation.node_functions import NodeFunctions
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE
+from dyngrasp.planning.problem import PhaseProblem
+from dyngrasp.signals import Array
+
+UNBOUNDED = 1e12  # an infinite limit as a number: its row then never comes near zero
+# An interval must have an interior: a narrower one is widened to this, in units of its scale.
+NARROWEST = 1e-9
+
+
+@dataclass(frozen=True)
+class LimitRows:
+    """Data of the rows of one problem.
+
+    Attributes:
+        middle, half_width: (n,) of the position limits (rad).
+        velocity, acceleration: (n,) limits; `acceleration` is empty if there is none.
+        lower_index, upper_index: Which of the constraints' rows have a finite lower or upper bound.
+        lower, upper: (m,) bounds divided by the scale.
+        inverse_scale: (m,)
+        free_at_ends: (m,) 1.0 where a row depends on v, so that it is not constant at the ends.
+        shortest, longest: Bounds of T (s).
+        fixed_duration: Whether they leave T no freedom.
+    """
+
+    middle: Array
+    half_width: Array
+    velocity: Array
+    acceleration: Array
+    lower_index: Array
+    upper_index: Array
+    lower: Array
+    upper: Array
+    inverse_scale: Array
+    free_at_ends: Array
+    shortest: float
+    longest: float
+    fixed_duration: bool
+
+    @classmethod
+    def of(cls, problem: PhaseProblem, functions: list[NodeFunctions]) -> LimitRows:
+        """The rows of a problem whose constraints are evaluated by `functions`, in the same order."""
+        q_min = np.maximum(problem.position_lower, -UNBOUNDED)
+        q_max = np.minimum(problem.position_upper, UNBOUNDED)
+        limited = np.isfinite(problem.acceleration_limit).any()
+        acceleration = np.minimum(problem.acceleration_limit, UNBOUNDED) if limited else np.empty(0)
+        none = [np.empty(0)]
+        scale = np.concatenate([c.scale for c in problem.constraints] or none)
+        lower = np.concatenate([c.lower for c in problem.constraints] or none) / scale
+        upper = np.concatenate([c.upper for c in problem.constraints] or none) / scale
+        widening = np.maximum(0.0, NARROWEST - (upper - lower)) / 2
+        free = np.concatenate([f.depends_on_acceleration for f in functions] or none)
+        shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
+        return cls(
+            (q_max + q_min) / 2,
+            np.maximum((q_max - q_min) / 2, NARROWEST),
+            np.minimum(problem.velocity_limit, UNBOUNDED),
+            acceleration,
+            np.flatnonzero(np.isfinite(lower)),
+            np.flatnonzero(np.isfinite(upper)),
+            lower - widening,
+            upper + widening,
+            1.0 / scale,
+            free.astype(float),
+            shortest,
+            problem.max_duration,
+            problem.max_duration - shortest <= NARROWEST * problem.max_duration,
+        )
+
+    @property
+    def constraint_rows(self) -> int:
+        """m, number of rows c of the constraints at a grid point."""
+        return self.lower.size
+
+    @property
+    def rows_per_point(self) -> int:
+        """R, number of one-sided rows at a grid point."""
+        boxes = 4 * self.velocity.size + 2 * self.acceleration.size
+        return boxes + self.lower_index.size + self.upper_index.size
+
+    @property
+    def arguments(self) -> tuple:
+        """What the compiled functions below take as `limits`."""
+        bounds = (self.lower_index, self.upper_index, self.lower, self.upper, self.inverse_scale, self.free_at_ends)
+        duration = (self.shortest, self.longest, self.fixed_duration)
+        return self.middle, self.half_width, self.velocity, self.acceleration, *bounds, *duration
+
+
+@njit(cache=True, error_model="numpy")
+def row_values(z: Array, T: float, c: Array, limits: tuple, g: Array) -> None:
+    """Write all rows g (K · R + 2,) from q, w, a (3, K, n), T and the constraints' rows c (K, m)."""
+    middle, half_width, velocity, acceleration, lo, up, lower, upper, scale, free, shortest, longest, fixed = limits
+    _, K, n = z.shape
+    R = (g.size - 2) // K
+    for k in range(K):
+        end = k == 0 or k == K - 1
+        at = k * R
+        for j in range(n):
+            q = (z[POSITION, k, j] - middle[j]) / half_width[j]
+            w = z[RATE, k, j] / velocity[j]
+            g[at + j] = 1.0 if end else 1.0 + q
+            g[at + n + j] = 1.0 if end else 1.0 - q
+            g[at + 2 * n + j] = 1.0 if end else T + w
+            g[at + 3 * n + j] = 1.0 if end else T - w
+        at += 4 * n
+        for j in range(acceleration.size):
+            a = z[CURVATURE, k, j] / acceleration[j]
+            g[at + j] = T * T + a
+            g[at + n + j] = T * T - a
+        at += 2 * acceleration.size
+        for i in range(lo.size):
+            j = lo[i]
+            g[at + i] = 1.0 if end and free[j] == 0.0 else c[k, j] * scale[j] - lower[j]
+        at += lo.size
+        for i in range(up.size):
+            j = up[i]
+            g[at + i] = 1.0 if end and free[j] == 0.0 else upper[j] - c[k, j] * scale[j]
+    g[-2] = 1.0 if fixed else (T - shortest) / longest
+    g[-1] = 1.0 if fixed else (longest - T) / longest
+
+
+@njit(cache=True, error_model="numpy")
+def row_steps(dz: Array, dT: float, T: float, v: Array, jacobian: Array, limits: tuple, dg: Array) -> None:
+    """Write J d, the change of all rows with q, w, a and T to first order.
+
+    Args:
+        dz: (3, K, n) changes of q, w, a.
+        dT: Change of T.
+        T: Where the rows are linearised (s).
+        v: (K, n) accelerations there, a / T².
+        jacobian: (K, m, 2n) of the constraints' rows by q and v.
+        limits: `LimitRows.arguments`.
+        dg: (K · R + 2,), overwritten.
+    """
+    _, half_width, velocity, acceleration, lo, up, _, _, scale, free, _, longest, fixed = limits
+    _, K, n = dz.shape
+    m = jacobian.shape[1]
+    R = (dg.size - 2) // K
+    dc = np.empty(m)
+    du = np.empty(2 * n)
+    for k in range(K):
+        end = k == 0 or k == K - 1
+        at = k * R
+        for j in range(n):
+            q = 0.0 if end else dz[POSITION, k, j] / half_width[j]
+            w = 0.0 if end else dz[RATE, k, j] / velocity[j]
+            dT_here = 0.0 if end else dT
+            dg[at + j] = q
+            dg[at + n + j] = -q
+            dg[at + 2 * n + j] = dT_here + w
+            dg[at + 3 * n + j] = dT_here - w
+        at += 4 * n
+        for j in range(acceleration.size):
+            a = dz[CURVATURE, k, j] / acceleration[j]
+            dg[at + j] = 2 * T * dT + a
+            dg[at + n + j] = 2 * T * dT - a
+        at += 2 * acceleration.size
+        for j in range(n):
+            du[j] = dz[POSITION, k, j]
+            du[n + j] = dz[CURVATURE, k, j] / (T * T) - 2.0 / T * v[k, j] * dT
+        for i in range(m):
+            change = 0.0
+            if not (end and free[i] == 0.0):
+                for j in range(2 * n):
+                    change += jacobian[k, i, j] * du[j]
+            dc[i] = change * scale[i]
+        for i in range(lo.size):
+            dg[at + i] = dc[lo[i]]
+        at += lo.size
+        for i in range(up.size):
+            dg[at + i] = -dc[up[i]]
+    dg[-2] = 0.0 if fixed else dT / longest
+    dg[-1] = 0.0 if fixed else -dT / longest
+
+
+@njit(cache=True, error_model="numpy")
+def constraint_weights(y: Array, limits: tuple, weights: Array) -> None:
+    """Write the factor of every constraint's row c in Σ y g: (y of its lower side − y of its upper side) / scale.
+
+    Args:
+        y: (K · R + 2,) factors of the one-sided rows.
+        limits: `LimitRows.arguments`.
+        weights: (K, m), overwritten; zero for rows that are constant at an end.
+    """
+    _, _, velocity, acceleration, lo, up, _, _, scale, free, _, _, _ = limits
+    K, m = weights.shape
+    R = (y.size - 2) // K
+    for k in range(K):
+        end = k == 0 or k == K - 1
+        at = k * R + 4 * velocity.size + 2 * acceleration.size
+        for i in range(m):
+            weights[k, i] = 0.0
+        for i in range(lo.size):
+            weights[k, lo[i]] += y[at + i] * scale[lo[i]]
+        at += lo.size
+        for i in range(up.size):
+            weights[k, up[i]] -= y[at + i] * scale[up[i]]
+        if end:
+            for i in range(m):
+                weights[k, i] *= free[i]
+
+
+@njit(cache=True, error_model="numpy")
+def rows_transposed(
+    y: Array, T: float, v: Array, jacobian: Array, limits: tuple, weights: Array, dual: Array
+) -> float:
+    """Add Jᵀ y, as derivatives by q, w, a to `dual` (3, K, n); return the derivative by T.
+
+    Args:
+        y: (K · R + 2,) factors of the rows.
+        T, v, jacobian, limits: As for `row_steps`.
+        weights: (K, m) from `constraint_weights` of the same y.
+        dual: (3, K, n), added to.
+    """
+    _, half_width, velocity, acceleration, _, _, _, _, _, _, _, longest, fixed = limits
+    _, K, n = dual.shape
+    m = jacobian.shape[1]
+    R = (y.size - 2) // K
+    by_T = 0.0
+    by_u = np.empty(2 * n)
+    for k in range(K):
+        at = k * R
+        if 0 < k < K - 1:
+            for j in range(n):
+                dual[POSITION, k, j] += (y[at + j] - y[at + n + j]) / half_width[j]
+                dual[RATE, k, j] += (y[at + 2 * n + j] - y[at + 3 * n + j]) / velocity[j]
+                by_T += y[at + 2 * n + j] + y[at + 3 * n + j]
+        at += 4 * n
+        for j in range(acceleration.size):
+            dual[CURVATURE, k, j] += (y[at + j] - y[at + n + j]) / acceleration[j]
+            by_T += 2 * T * (y[at + j] + y[at + n + j])
+        for j in range(2 * n):
+            by_u[j] = 0.0
+        for i in range(m):
+            for j in range(2 * n):
+                by_u[j] += weights[k, i] * jacobian[k, i, j]
+        for j in range(n):
+            dual[POSITION, k, j] += by_u[j]
+            dual[CURVATURE, k, j] += by_u[n + j] / (T * T)
+            by_T -= 2.0 / T * v[k, j] * by_u[n + j]
+    if not fixed:
+        by_T += (y[y.size - 2] - y[y.size - 1]) / longest
+    return by_T
