@@ -66,6 +66,24 @@ def _link_pose(model: pin.Model, i: int, q_i: ca.SX) -> tuple[ca.SX, ca.SX]:
     return _exact(placement.rotation) @ _rotation(_axis(model.joints[i]), q_i), _exact(placement.translation)
 
 
+def _motions(robot: RobotModel, q: ca.SX, w: ca.SX, v: ca.SX) -> list[tuple[ca.SX, ca.SX, ca.SX]]:
+    """ω, α and a of the origin of each link and, last, of the flange, each in its own axes; a includes −g."""
+    model = robot.pin_model
+    omega, alpha = ca.SX.zeros(3), ca.SX.zeros(3)
+    a = -_exact(model.gravity.linear)  # gravity is an upward acceleration of the base
+    motions = []
+    for i in range(1, robot.n + 1):
+        R, p = _link_pose(model, i, q[i - 1])
+        axis = _exact(_axis(model.joints[i]))
+        a = R.T @ (a + ca.cross(alpha, p) + ca.cross(omega, ca.cross(omega, p)))
+        alpha = R.T @ alpha + v[i - 1] * axis + ca.cross(R.T @ omega, w[i - 1] * axis)
+        omega = R.T @ omega + w[i - 1] * axis
+        motions.append((omega, alpha, a))
+    R, p = _exact(robot.T_last_flange.rotation), _exact(robot.T_last_flange.translation)
+    a = R.T @ (a + ca.cross(alpha, p) + ca.cross(omega, ca.cross(omega, p)))
+    return motions + [(R.T @ omega, R.T @ alpha, a)]
+
+
 def _newton_euler(robot: RobotModel, q: ca.SX, w: ca.SX, v: ca.SX, payload: ca.SX) -> ca.SX:
     """τ = M(q) v + C(q, w) w + g(q); every vector of link i is in the axes of link i."""
     model, n = robot.pin_model, robot.n
@@ -73,19 +91,11 @@ def _newton_euler(robot: RobotModel, q: ca.SX, w: ca.SX, v: ca.SX, payload: ca.S
     poses = [_link_pose(model, i, q[i - 1]) for i in range(1, n + 1)]
     bodies = [_Body.from_parameters(_exact(model.inertias[i].toDynamicParameters())) for i in range(1, n + 1)]
 
-    omega, alpha = ca.SX.zeros(3), ca.SX.zeros(3)
-    a = -_exact(model.gravity.linear)  # gravity is an upward acceleration of the base
-    wrenches = []
-    for i in range(n):
-        R, p = poses[i]
-        a = R.T @ (a + ca.cross(alpha, p) + ca.cross(omega, ca.cross(omega, p)))
-        alpha = R.T @ alpha + v[i] * axes[i] + ca.cross(R.T @ omega, w[i] * axes[i])
-        omega = R.T @ omega + w[i] * axes[i]
-        wrenches.append(bodies[i].wrench(omega, alpha, a))
+    *link_motions, flange_motion = _motions(robot, q, w, v)
+    wrenches = [body.wrench(*motion) for body, motion in zip(bodies, link_motions, strict=True)]
 
     R, p = _exact(robot.T_last_flange.rotation), _exact(robot.T_last_flange.translation)
-    a_flange = R.T @ (a + ca.cross(alpha, p) + ca.cross(omega, ca.cross(omega, p)))
-    force, moment = _Body.from_parameters(payload).wrench(R.T @ omega, R.T @ alpha, a_flange)
+    force, moment = _Body.from_parameters(payload).wrench(*flange_motion)
 
     torque = [ca.SX(0)] * n
     for i in reversed(range(n)):
@@ -146,6 +156,21 @@ def full_inverse_dynamics(robot: RobotModel) -> ca.Function:
         return ca.Function("full_inverse_dynamics", [q, w, v, payload], [tau], ["q", "w", "v", "payload"], ["tau"])
 
     return _cached(robot, "full_inverse_dynamics", build)
+
+
+def payload_wrench(robot: RobotModel) -> ca.Function:
+    """(q (n,), v (n,), payload (10,)) → force (3,), moment (3,) about the flange origin, in flange axes (N, Nm).
+
+    What the flange exerts on a payload for q̈ = v at q̇ = 0, its weight included: the last link of the recursion of `torque`.
+    """
+
+    def build() -> ca.Function:
+        q, v = ca.SX.sym("q", robot.n), ca.SX.sym("v", robot.n)
+        payload = ca.SX.sym("payload", PAYLOAD_SIZE)
+        wrench = _Body.from_parameters(payload).wrench(*_motions(robot, q, ca.SX.zeros(robot.n), v)[-1])
+        return ca.Function("payload_wrench", [q, v, payload], list(wrench), ["q", "v", "payload"], ["force", "moment"])
+
+    return _cached(robot, "payload_wrench", build)
 
 
 def payload_vector(inertia: pin.Inertia) -> Array:

@@ -163,7 +163,8 @@ def hold(
 
     def build() -> ca.Function:
         q, v, p = _inputs(robot, 19)
-        force, moment = _part_wrench(robot, q, v, p[:10], p[10:13])
+        force, moment = symbolic.payload_wrench(robot)(q, v, p[:10])
+        moment -= ca.cross(p[10:13], force)
         axis = p[13:16]
         along = ca.dot(axis, force)
         tangential = p[16] ** 2 * ca.sumsqr(force - along * axis)
@@ -175,6 +176,33 @@ def hold(
     parameters = _at_each(numbers, intervals)
     return NodeConstraint(
         "hold", function, parameters, [-np.inf, -closing_share], [limit, closing_share], [limit, closing_share]
+    )
+
+
+def above_ground(robot: RobotModel, points: ArrayLike, intervals: int, depth: float = 1e-4) -> NodeConstraint:
+    """The carried part stays out of the ground: the corners of its underside have a height ≥ −depth.
+
+    The paper has no such row; with time-optimal weights the part would dig an edge into the ground as it is lifted.
+
+    Args:
+        robot: The arm.
+        points: (K, 3) corners in the flange frame (m).
+        intervals: N of the grid.
+        depth: Rounding allowed (m), > 0, because the part stands on the ground when it is taken.
+    """
+    corners = _points(points)
+    count = len(corners)
+
+    def build() -> ca.Function:
+        q, v, p = _inputs(robot, 3 * count)
+        R, position = symbolic.flange_pose(robot)(q)
+        heights = [position[2] + ca.dot(R[2, :].T, p[3 * i : 3 * i + 3]) for i in range(count)]
+        return ca.Function("above_ground", [q, v, p], [ca.vertcat(*heights)], ["q", "v", "p"], ["g"])
+
+    function = _cached(robot, f"above_ground_{count}", build)
+    lower, upper = np.full(count, -depth), np.full(count, np.inf)
+    return NodeConstraint(
+        "above_ground", function, _at_each(corners.ravel(), intervals), lower, upper, np.full(count, 0.01)
     )
 
 
@@ -204,20 +232,6 @@ def holding_margin(part: pin.Inertia, T_world_grasp: pin.SE3, friction: Friction
 
 def _inverse_capacities(friction: Friction, pinch_force: float) -> Array:
     return 1 / (pinch_force * np.array([2 * friction.sliding, 2 * friction.torsional, 1.0]))
-
-
-def _part_wrench(robot: RobotModel, q: ca.SX, v: ca.SX, part: ca.SX, p_G: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Force and moment about G, in flange axes, that the hand exerts on the part for q̈ = v at q̇ = 0."""
-    R, p = symbolic.flange_pose(robot)(q)
-    gravity = ca.DM(robot.pin_model.gravity.linear)
-    a = R.T @ (ca.jtimes(p, q, v) - gravity)
-    spin = R.T @ ca.reshape(ca.jtimes(ca.vec(R), q, v), 3, 3)
-    alpha = ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
-    m, mc = part[0], part[1:4]
-    xx, xy, yy, xz, yz, zz = ca.vertsplit(part[4:10])
-    inertia = ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz))
-    force = m * a + ca.cross(alpha, mc)
-    return force, inertia @ alpha + ca.cross(mc, a) - ca.cross(p_G, force)
 
 
 def _in_grasp_frame(robot: RobotModel, q: ca.SX, p_G: ca.SX, frame: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
