@@ -43,7 +43,9 @@ def require() -> None:
         return
     egl = _egl_library()
     if egl is None:
-        raise RenderingUnavailable("no off-screen rendering: libEGL.so.1 is missing; on Debian or Ubuntu install libegl1")
+        raise RenderingUnavailable(
+            "no off-screen rendering: libEGL.so.1 is missing; on Debian or Ubuntu install libegl1"
+        )
     if backend != "egl":
         raise RenderingUnavailable(
             f"no off-screen rendering: MuJoCo was loaded with MUJOCO_GL={backend or '(unset)'}; set MUJOCO_GL=egl"

@@ -115,6 +115,11 @@ class MujocoPlant:
         data.ctrl[self._gripper] = np.clip(command.gripper_torque, -limit, limit)
         mujoco.mj_step(scene.model, data)
 
+    @property
+    def applied(self) -> Command:
+        """Torques that the motors gave in the last step (Nm), after saturation; zeros before the first."""
+        return Command(self._data.actuator_force[self._arm], self._data.actuator_force[self._gripper])
+
     def truth(self) -> Truth:
         """See `Truth`. Contacts and forces are those at the start of the last step, as MuJoCo computes them."""
         scene, data = self.scene, self._data
@@ -125,7 +130,7 @@ class MujocoPlant:
         hand = scene.hand_body
         T_world_hand = pin.SE3(data.xmat[hand].reshape(3, 3).copy(), data.xpos[hand].copy())
         kinds = scene.geom_kind[data.contact.geom]
-        present = np.unique(_CATEGORY_TABLE[kinds[:, 0], kinds[:, 1]])
+        present = set(_CATEGORY_TABLE[kinds[:, 0], kinds[:, 1]].tolist())
         return Truth(
             t=self.t,
             T_world_part=T_world_part,
@@ -137,10 +142,8 @@ class MujocoPlant:
             arm_velocity=data.qvel[scene.arm_dof],
             gripper_position=data.qpos[scene.gripper_qpos],
             gripper_velocity=data.qvel[scene.gripper_dof],
-            arm_torque=data.actuator_force[self._arm],
-            gripper_torque=data.actuator_force[self._gripper],
             pad_force=self._pad_force(part_only=True),
-            contacts=tuple(bool(np.isin(category, present)) for category in ContactCategory),
+            contacts=tuple(category in present for category in ContactCategory),
         )
 
     def _encode(self, position: Array) -> Array:
@@ -165,5 +168,3 @@ class MujocoPlant:
             # With elliptic cones the first row of a contact is its normal force.
             force[i] = data.efc_force[address[on_pad]].sum()
         return force
-
-

@@ -51,8 +51,6 @@ class Truth:
         p_world_grasp_point: (3,), midpoint of the two pad frames (m): the grasp point G as the fingers stand.
         arm_position, arm_velocity: (n,) true joint states (rad, rad/s).
         gripper_position, gripper_velocity: (m,) true states of the planned gripper joints (rad, rad/s).
-        arm_torque: (n,) torques that the motors applied, after saturation (Nm).
-        gripper_torque: (m,) likewise.
         pad_force: (pads,) normal force between each pad and the part (N).
         contacts: (5,) bool, whether contacts of each `ContactCategory` exist.
     """
@@ -66,8 +64,6 @@ class Truth:
     arm_velocity: Array
     gripper_position: Array
     gripper_velocity: Array
-    arm_torque: Array
-    gripper_torque: Array
     pad_force: Array
     contacts: tuple[bool, ...]
 
@@ -76,8 +72,6 @@ class Truth:
         object.__setattr__(self, "p_world_grasp_point", read_only(self.p_world_grasp_point, (3,)))
         for name in ("arm_position", "arm_velocity", "gripper_position", "gripper_velocity", "pad_force"):
             object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
-        for name in ("arm_torque", "gripper_torque"):
-            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
 
 
 class TruthfulPlant(Plant, Protocol):
@@ -85,4 +79,14 @@ class TruthfulPlant(Plant, Protocol):
 
     def truth(self) -> Truth:
         """The state that the sensors only hint at."""
+        ...
+
+    @property
+    def applied(self) -> Command:
+        """The torques that the motors gave in the last step, after saturation."""
+        ...
+
+    @property
+    def state(self) -> Array:
+        """Generalised positions of everything in the scene, for the renderer."""
         ...

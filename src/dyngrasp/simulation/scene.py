@@ -225,12 +225,20 @@ def _add_part(spec: MjSpec, grasp_object: GraspObject, variation: PlantVariation
     part.ipos = inertia.lever
     part.fullinertia = [I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]]
     spec.add_material(name="cast_aluminium", rgba=[0.66, 0.67, 0.68, 1.0], specular=0.35, shininess=0.25)
-    spec.add_mesh(name="part_visual", file=str(grasp_object.visual_mesh), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    spec.add_mesh(
+        name="part_visual", file=str(grasp_object.mesh_path), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    )
     mesh = mujoco.mjtGeom.mjGEOM_MESH
     part.add_geom(
-        name="part_visual", type=mesh, meshname="part_visual", material="cast_aluminium", group=2, contype=0, conaffinity=0
+        name="part_visual",
+        type=mesh,
+        meshname="part_visual",
+        material="cast_aluminium",
+        group=2,
+        contype=0,
+        conaffinity=0,
     )
-    for k, path in enumerate(grasp_object.collision_meshes):
+    for k, path in enumerate(grasp_object.piece_paths):
         name = f"part_piece_{k}"
         spec.add_mesh(name=name, file=str(path), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
         part.add_geom(name=name, type=mesh, meshname=name, group=3, rgba=[0.3, 0.6, 0.9, 0.4])

@@ -1,0 +1,98 @@
+"""The running loop: the one place where plan, controllers and plant meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from dyngrasp.closed_loop.clock import Clock
+from dyngrasp.closed_loop.record import EpisodeRecord, Recorder
+from dyngrasp.control.computed_torque import ComputedTorque, ComputedTorqueSettings
+from dyngrasp.control.grasp_controller import Controller, GraspController
+from dyngrasp.control.gripper_control import GripperController, GripperControlSettings
+from dyngrasp.models.grasp_object import Grasp
+from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.simulation.plant import TruthfulPlant
+from dyngrasp.trajectory import GraspPlan
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """Rates of the loop.
+
+    Attributes:
+        control_period: Of controllers and plant (s). 1 ms; the paper's 125 µs works as well.
+        hold_time: How long the arm holds the part at the target before the episode ends (s): slow slip shows there.
+        record_rate: Samples a second in the record (Hz); contacts between samples are not lost.
+    """
+
+    control_period: float = 1e-3
+    hold_time: float = 0.5
+    record_rate: float = 250.0
+
+
+def grasp_controller(
+    task: GraspTask,
+    grasp: Grasp,
+    control_period: float,
+    arm: ComputedTorqueSettings | None = None,
+    hand: GripperControlSettings | None = None,
+) -> GraspController:
+    """Controllers of arm and hand for a task, from the nominal models.
+
+    Args:
+        task: Arm, gripper, part.
+        grasp: Which grasp is taken; it says how the part hangs in the hand.
+        control_period: Of the loop (s).
+        arm: Gains of the arm.
+        hand: Gains and forces of the hand.
+    """
+    return GraspController(
+        task.robot,
+        task.gripper,
+        ComputedTorque(task.robot_empty, task.robot_loaded(grasp), control_period, arm),
+        GripperController(task.gripper, control_period, hand),
+    )
+
+
+def run_episode(
+    plan: GraspPlan,
+    plant: TruthfulPlant,
+    controller: Controller,
+    settings: EpisodeSettings | None = None,
+    *,
+    progress: Callable[[float, str], None] | None = None,
+    meta: dict[str, Any] | None = None,
+) -> EpisodeRecord:
+    """Carry out a plan.
+
+    The controllers see observations and the plan; the truth goes into the record and nowhere else.
+
+    Args:
+        plan: What to do.
+        plant: Where it happens; its time must be the plan's start, its period the control period.
+        controller: Turns both into torques.
+        settings: Rates.
+        progress: Called at every recorded sample with the time (s) and the name of the phase.
+        meta: Kept with the record.
+    """
+    settings = settings or EpisodeSettings()
+    clock = Clock(
+        settings.control_period, plan.start_time, plan.end_time + settings.hold_time, record_rate=settings.record_rate
+    )
+    recorder = Recorder(plan.arm_joints, plan.gripper_joints, settings.control_period)
+    for tick in clock:
+        observed = plant.observe()
+        # Between observing and sampling the plan is where a pose source and a replanner take their turn.
+        sample = plan.sample(tick.t)
+        command = controller.command(observed, sample)
+        truth, state = plant.truth(), plant.state
+        recorder.watch(observed, truth)
+        plant.step(command)
+        if tick.record:
+            applied = plant.applied
+            recorder.sample(observed, truth, sample, command, applied, state)
+            if progress is not None:
+                progress(tick.t, sample.phase)
+    return recorder.finish(meta)
