@@ -18,6 +18,9 @@ from dyngrasp.signals import Array, read_only
 # A piece counts as convex if it fills its hull to this share: vertices are stored in single precision.
 CONVEX_SHARE = 1e-4
 
+# Corners that stand for the outline of the underside; in between, an edge is at most a few millimetres farther out.
+UNDERSIDE_CORNERS = 8
+
 
 class GraspTable(StrictSchema):
     """One `[[grasps]]` entry."""
@@ -161,6 +164,18 @@ class GraspObject:
     def spatial_inertia(self) -> pin.Inertia:
         """Mass, centre of mass and inertia in the object frame; not to be changed."""
         return pin.Inertia(self.mass, np.array(self.centre_of_mass), np.array(self.inertia))
+
+    @cached_property
+    def underside(self) -> Array:
+        """(UNDERSIDE_CORNERS, 3) corners of the face it stands on, in the object frame (m).
+
+        They are the outermost of its lowest points in as many evenly spread directions; some may coincide.
+        """
+        vertices = np.vstack([trimesh.load_mesh(path).vertices for path in self.piece_paths])
+        lowest = vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-4]
+        angles = 2 * np.pi * np.arange(UNDERSIDE_CORNERS) / UNDERSIDE_CORNERS
+        directions = np.column_stack([np.cos(angles), np.sin(angles)])
+        return read_only(lowest[np.argmax(directions @ lowest[:, :2].T, axis=1)])
 
 
 def read_object(path: str | Path) -> GraspObject:

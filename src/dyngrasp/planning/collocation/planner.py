@@ -45,7 +45,7 @@ class CollocationSettings:
     torque_fraction: float = 0.9
     position_margin: float = 0.01
     funnel_margin: float = 0.002
-    hold_safety: float = 1.5
+    hold_safety: float = 2.0
     max_duration: float = 30.0
 
     def __post_init__(self) -> None:
@@ -155,7 +155,11 @@ class CollocationPlanner:
             max(bounds[1], task.settings.grasp_duration_min),
             longest,
         )
-        carry = (constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction), self._hold(targets))
+        carry = (
+            constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction),
+            self._hold(targets),
+            self._above_ground(targets),
+        )
         deliver = self._phase("deliver", targets.grasped, targets.place, carry, 0.0, settings.max_duration)
         return approach, grasp, deliver
 
@@ -261,16 +265,27 @@ class CollocationPlanner:
     def _hold(self, targets: GraspTargets) -> NodeConstraint:
         task = self.task
         T_flange_grasp = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_closed)
-        T_flange_object = T_flange_grasp * targets.grasp.T_object_grasp.inverse()
         return constraints.hold(
             task.robot,
-            T_flange_object.act(task.grasp_object.spatial_inertia),
+            self._T_flange_object(targets).act(task.grasp_object.spatial_inertia),
             T_flange_grasp,
             task.grasp_object.friction,
             task.gripper.pinch_force,
             self.settings.intervals,
             self.settings.hold_safety,
         )
+
+    def _above_ground(self, targets: GraspTargets) -> NodeConstraint:
+        T, corners = self._T_flange_object(targets), self.task.grasp_object.underside
+        return constraints.above_ground(
+            self.task.robot, corners @ T.rotation.T + T.translation, self.settings.intervals
+        )
+
+    def _T_flange_object(self, targets: GraspTargets) -> pin.SE3:
+        """The part in the flange frame as the closed hand holds it."""
+        gripper = self.task.gripper
+        T_flange_grasp = gripper.T_flange_hand * gripper.T_hand_grasp(targets.gripper_closed)
+        return T_flange_grasp * targets.grasp.T_object_grasp.inverse()
 
 
 def _state(q_start: Array | JointState) -> BoundaryState:
