@@ -24,6 +24,5 @@ for entry in result.audit.entries:
     print(f"  {entry}")
 
 state = plan.sample(plan.phase_ends[0])
-print(
-    f"at {state.arm.t:.2f} s the grasp begins; fastest joint {np.abs(state.arm.velocity).max():.3f} rad/s: it does not stop"
-)
+fastest = np.abs(state.arm.velocity).max()
+print(f"at {state.arm.t:.2f} s the grasp begins, and the fastest joint turns with {fastest:.3f} rad/s: nothing stops")
