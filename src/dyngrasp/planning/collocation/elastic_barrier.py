@@ -25,6 +25,8 @@ from numba import njit
 
 from dyngrasp.signals import Array
 
+ROUNDING = 1e-12  # of a row in its scaled unit; accelerations are known to this
+
 
 @njit(cache=True, error_model="numpy")
 def start(g: Array, mu: float, price: float, least_slack: float, s: Array, t: Array, multiplier: Array) -> None:
@@ -130,21 +132,36 @@ def second_order_terms(ds: Array, dt: Array, dmultiplier: Array, e_s: Array, e_t
 
 @njit(cache=True, error_model="numpy")
 def moved_slacks(
-    g: Array, s: Array, t: Array, ds: Array, dt: Array, length: float, s_new: Array, t_new: Array
+    g: Array,
+    s: Array,
+    t: Array,
+    ds: Array,
+    dt: Array,
+    length: float,
+    price: float,
+    mu: float,
+    s_new: Array,
+    t_new: Array,
 ) -> None:
-    """Slacks after a step, one of the two raised until s − t = g holds for the rows g at the new point.
+    """Slacks after a step, moved until s − t = g holds for the rows g at the new point.
 
-    Raising never increases the merit beyond its linear prediction: a larger s lowers the barrier, and a larger t costs
-    what the violation costs.
+    Neither move increases the merit beyond its linear prediction. Where the row turned out larger than predicted, a
+    larger s lowers the barrier; where it turned out smaller, a larger t costs what the violation costs. And where a row
+    holds with room to spare, both come down together until t is twice what the barrier would make it at least.
     """
+    small = 2 * mu / price
     for i in range(g.size):
         s_new[i] = s[i] + length * ds[i]
         t_new[i] = t[i] + length * dt[i]
         gap = g[i] + t_new[i] - s_new[i]
-        if gap > 0:
+        # A gap of rounding is none: carried into t it would keep t from going to zero with μ.
+        if gap > ROUNDING:
             s_new[i] += gap
-        else:
+        elif gap < -ROUNDING:
             t_new[i] -= gap
+        if g[i] > 2 * small and t_new[i] > small:
+            t_new[i] = small
+            s_new[i] = g[i] + small
 
 
 @njit(cache=True, error_model="numpy")

@@ -99,6 +99,26 @@ class LimitRows:
         boxes = 4 * self.velocity.size + 2 * self.acceleration.size
         return boxes + self.lower_index.size + self.upper_index.size
 
+    def violation(self, g: Array, T: float) -> tuple[float, str]:
+        """Largest violation among the rows g (K · R + 2,), in units of each limit, and its kind; (0, "") if none.
+
+        Args:
+            g: Rows from `row_values`.
+            T: Duration (s), which scales the rows of velocity and acceleration.
+        """
+        n, accelerations = self.velocity.size, 2 * self.acceleration.size
+        least = g[:-2].reshape(-1, self.rows_per_point).min(axis=0)
+        kinds = {
+            "position": least[: 2 * n],
+            "velocity": least[2 * n : 4 * n] / T,
+            "acceleration": least[4 * n : 4 * n + accelerations] / T**2,
+            "constraint": least[4 * n + accelerations :],
+            "duration": g[-2:],
+        }
+        worst = {name: -float(rows.min(initial=np.inf)) for name, rows in kinds.items()}
+        name = max(worst, key=lambda kind: worst[kind])
+        return (worst[name], name) if worst[name] > 0 else (0.0, "")
+
     @property
     def arguments(self) -> tuple:
         """What the compiled functions below take as `limits`."""
@@ -222,9 +242,7 @@ def constraint_weights(y: Array, limits: tuple, weights: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def rows_transposed(
-    y: Array, T: float, v: Array, jacobian: Array, limits: tuple, weights: Array, dual: Array
-) -> float:
+def rows_transposed(y: Array, T: float, v: Array, jacobian: Array, limits: tuple, weights: Array, dual: Array) -> float:
     """Add Jᵀ y, as derivatives by q, w, a to `dual` (3, K, n); return the derivative by T.
 
     Args:

@@ -59,7 +59,8 @@ class ThreeTap:
         # reach[k, z, end, before/after]: how r[−1], r[1] and r[N−1], r[N+1] enter z[k].
         offset = np.einsum("kzes,ej->zkj", reach, 2 * ends)
         slope = h * np.einsum("kze,ej->zkj", reach[..., 1] - reach[..., 0], rates)
-        return cls(first, taps, offset, slope)
+        # einsum may hand out transposed memory; compiled code reads these arrays row by row.
+        return cls(first, taps, np.ascontiguousarray(offset), np.ascontiguousarray(slope))
 
     def unknowns(self, trajectory: Trajectory) -> Array:
         """(N−1, n) x of a motion on this grid: r[k] = q[k] − h² a[k] / 4."""

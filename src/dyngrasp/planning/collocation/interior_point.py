@@ -1,0 +1,305 @@
+"""A primal-dual interior point method with elastic rows, in two modes.
+
+Free mode: Mehrotra's predictor–corrector chooses the barrier parameter anew in every iteration, and full steps to the
+boundary are taken as long as the error estimate E falls within a few iterations. Monotone mode: the barrier parameter is
+fixed until its problem is solved, and Armijo's rule on the barrier merit function accepts steps. The method falls
+back from the first to the second where E stalls, and returns when E has fallen again (Nocedal, Wächter, Waltz 2009,
+"Adaptive barrier update strategies for nonlinear interior methods"); in monotone mode every step is a descent step of a smooth
+function bounded below, hence the iterates approach its stationary points (Gould, Orban, Toint 2015, for elastic rows).
+
+The Newton matrix is made positive definite: the banded part by adding multiples of the second derivative of Σ|a|² until
+its Cholesky factorisation succeeds, the row of T by replacing a Schur complement that is not positive.
+
+E = dᵀ K d + Σ s λ + Σ t (ν − λ), with d the step for μ = 0 and K the Newton matrix: near a solution twice what a full step
+lowers the objective by, plus the duality gap. It has the unit of the objective whatever the grid.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+
+from dyngrasp.planning.collocation import elastic_barrier as rows
+from dyngrasp.planning.collocation.phase_model import PhaseModel
+from dyngrasp.signals import Array
+
+
+@dataclass(frozen=True)
+class InteriorPointSettings:
+    """Settings of `InteriorPoint`.
+
+    Attributes:
+        tolerance: E at the solution, relative to the objective.
+        violation_tolerance: Largest violation of a row at the solution, in its scaled unit.
+        max_iterations: Newton systems.
+        initial_barrier: μ at the start, relative to the objective.
+        least_slack: Slack that a violated row begins with.
+        price: ν at the start, relative to the objective.
+    """
+
+    tolerance: float = 1e-9
+    violation_tolerance: float = 1e-9
+    max_iterations: int = 200
+    initial_barrier: float = 1e-3
+    least_slack: float = 1e-2
+    price: float = 1e3
+
+
+class Outcome(Enum):
+    """How an attempt ended."""
+
+    OPTIMAL = auto()
+    INFEASIBLE = auto()
+    ITERATION_LIMIT = auto()
+    STALLED = auto()
+    DEADLINE = auto()
+    NONFINITE = auto()
+
+
+@dataclass
+class Best:
+    """The best iterate so far: the cheapest that violates nothing, else the one that violates least."""
+
+    x: Array
+    T: float
+    objective: float = np.inf
+    violation: float = np.inf
+
+    def offer(self, x: Array, T: float, objective: float, violation: float, tolerance: float) -> None:
+        if not np.isfinite(objective + violation):
+            return
+        if violation <= tolerance:
+            better = self.violation > tolerance or objective < self.objective
+        else:
+            better = violation < self.violation
+        if better:
+            self.x[:], self.T, self.objective, self.violation = x, T, objective, violation
+
+
+KEEP = 0.995  # a step takes at most this share of a slack or multiplier
+MEMORY = 5  # iterations within which E must fall in free mode
+FALL = 0.9999  # by which factor
+ARMIJO = 1e-4
+ROUNDING = 1e-13  # of the merit, relative
+SHORTEST = 1e-10  # step length at which the line search gives up
+SPREAD = 1e10  # multipliers stay within this factor of μ / s, as the convergence proof wants
+LARGEST_CHANGE = 0.7  # of T in one step, relative: 1/T³ knows nothing of the other side of zero
+DEARER = 100.0  # factor of ν after a feasible point was found that ν had not been high enough to find
+STATIONARY = 1e-6  # E at a least violation, relative to the price of that violation
+ACCEPTABLE = 1e3  # multiple of the tolerance that counts as solved where rounding allows no further descent
+
+
+class InteriorPoint:
+    """The method; arrays are kept from one solve to the next of the same size."""
+
+    def __init__(self, settings: InteriorPointSettings) -> None:
+        self.settings = settings
+        self._size = (0, 0, 0)
+
+    def _allocate(self, model: PhaseModel, x: Array) -> None:
+        size = (*x.shape, model.rows)
+        if size == self._size:
+            return
+        self._size = size
+        self.x, self.dx, self.x_new, self.rhs = (np.zeros(x.shape) for _ in range(4))
+        M = model.rows
+        self.s, self.t, self.multiplier, self.ds, self.dt, self.dmultiplier = (np.zeros(M) for _ in range(6))
+        self.g, self.dg, self.omega, self.y, self.e_s, self.e_t = (np.zeros(M) for _ in range(6))
+        self.s_new, self.t_new, self.g_new, self.zero = (np.zeros(M) for _ in range(4))
+
+    def solve(
+        self, model: PhaseModel, x: Array, T: float, deadline: float, multiplier: Array | None = None
+    ) -> tuple[Outcome, Best, int]:
+        """Minimise from x (N−1, n) and T.
+
+        Args:
+            model: The problem.
+            x, T: Start.
+            deadline: A value of `time.perf_counter`; the best iterate until then is returned.
+            multiplier: Multipliers of the rows at the solution of a problem nearby, for a warm start.
+
+        Returns:
+            How it ended, the best iterate, and the number of Newton systems.
+        """
+        self.model = model
+        self._allocate(model, x)
+        settings = self.settings
+        self.x[:], self.T = x, T
+        objective = model.values(self.x, self.T, self.g)
+        if not np.isfinite(objective):
+            return Outcome.NONFINITE, Best(self.x.copy(), T), 0
+        self.unit = max(abs(objective), 1e-3)
+        self.price = settings.price * self.unit
+        self.best = Best(self.x.copy(), T)
+        self._restart(1.0, multiplier)
+        for iteration in range(settings.max_iterations + 1):
+            objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
+            violation = max(0.0, -float(self.g.min()))
+            if not np.isfinite(objective + violation):
+                return Outcome.NONFINITE, self.best, iteration
+            self.best.offer(self.x, self.T, objective, violation, settings.violation_tolerance)
+            feasible = violation <= settings.violation_tolerance
+            if model.factor == 0.0 and feasible:
+                # There is a feasible point after all: the price of a violation had been too low.
+                self.price *= DEARER
+                self._restart(1.0, None)
+                objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
+            if not self._factorise():
+                return Outcome.NONFINITE, self.best, iteration
+            decrement = self._direction(0.0, corrected=False)
+            mean, elastic = self._complementarity(0.0, 0.0)
+            error = decrement + mean * self.s.size + elastic
+            if not np.isfinite(error):
+                return Outcome.NONFINITE, self.best, iteration
+            if feasible and error <= settings.tolerance * self.unit:
+                return Outcome.OPTIMAL, self.best, iteration
+            if model.factor == 0.0 and error <= STATIONARY * self.price * violation:
+                return Outcome.INFEASIBLE, self.best, iteration
+            if iteration == settings.max_iterations:
+                return Outcome.ITERATION_LIMIT, self.best, iteration
+            if time.perf_counter() > deadline:
+                return Outcome.DEADLINE, self.best, iteration
+            if model.factor == 1.0 and not feasible and error <= settings.tolerance * self.price * violation:
+                # The cheapest point violates a row: is there any that does not?
+                self._restart(0.0, None)
+                continue
+            self._choose_mode(error, mean)
+            if self.free:
+                self._mehrotra_step(mean)
+            elif not self._armijo_step(objective):
+                if feasible and model.factor == 1.0:
+                    solved = error <= ACCEPTABLE * settings.tolerance * self.unit
+                    return Outcome.OPTIMAL if solved else Outcome.STALLED, self.best, iteration
+                if model.factor == 0.0:
+                    return Outcome.INFEASIBLE, self.best, iteration
+                self._restart(0.0, None)
+        raise AssertionError("the loop returns in its last round")
+
+    def _restart(self, factor: float, multiplier: Array | None) -> None:
+        """Slacks and multipliers for the present point, in free mode; `factor` weighs the objective."""
+        settings = self.settings
+        self.model.factor = factor
+        self.mu = settings.initial_barrier * self.unit
+        self.model.values(self.x, self.T, self.g)
+        rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
+        self.free, self.history, self.reference = True, [], np.inf
+        self.last_shift = 0.0
+
+    def _choose_mode(self, error: float, mean: float) -> None:
+        recent = self.history[-MEMORY:]
+        if self.free and len(recent) == MEMORY and error > FALL * max(recent):
+            self.free, self.reference = False, FALL * max(recent)
+            self.mu = 0.8 * mean
+        elif not self.free and error <= self.reference:
+            self.free = True
+        if self.free:
+            self.history.append(error)
+
+    def _complementarity(self, primal: float, dual: float) -> tuple[float, float]:
+        """Mean of s λ and sum of t (ν − λ) after steps of these lengths."""
+        pair = (self.s, self.t, self.multiplier, self.price)
+        return rows.complementarity(*pair, self.ds, self.dt, self.dmultiplier, primal, dual)
+
+    def _factorise(self) -> bool:
+        """Newton matrix at the current point, its inertia corrected; False if that fails beyond repair."""
+        rows.stiffness(self.s, self.t, self.multiplier, self.price, self.omega)
+        model = self.model
+        unit = self.unit / (model.problem.intervals * self.T**2)
+        shift = 0.0
+        while not model.factorise(self.omega, self.multiplier, shift):
+            shift = 8.0 * shift if shift > 0 else max(self.last_shift / 3, 1e-6 * unit)
+            if shift > 1e20 * unit or not np.isfinite(model.corner):
+                return False
+        if shift > 0:
+            self.last_shift = shift
+        least = 1e-8 * self.unit / self.T**2
+        if model.complement < least:
+            model.complement = max(-model.complement, 1e5 * least)
+        return True
+
+    def _direction(self, mu: float, corrected: bool) -> float:
+        """Newton direction for a barrier parameter; returns dᵀ K d, which is dᵀ times the right-hand side.
+
+        Args:
+            mu: Aim of all complementarity products.
+            corrected: Whether to add the second-order terms of the present direction, Mehrotra's corrector.
+        """
+        if corrected:
+            rows.second_order_terms(self.ds, self.dt, self.dmultiplier, self.e_s, self.e_t)
+        else:
+            self.e_s[:], self.e_t[:] = 0.0, 0.0
+        model = self.model
+        pair = (self.s, self.t, self.multiplier, self.price)
+        aim = (mu, self.e_s, self.e_t, self.omega, self.y)
+        rows.target_multipliers(*pair, *aim)
+        by_T = model.descent(self.y, self.rhs)
+        self.dx[:] = self.rhs
+        self.dT = model.solve(self.dx, by_T)
+        model.row_steps(self.dx, self.dT, self.dg)
+        rows.row_direction(self.dg, *pair, *aim, self.ds, self.dt, self.dmultiplier)
+        return float(np.vdot(self.rhs, self.dx)) + by_T * self.dT
+
+    def _lengths(self, keep: float) -> tuple[float, float]:
+        """Lengths of the step of x, T and slacks, and of the step of the multipliers."""
+        pair = (self.s, self.t, self.multiplier, self.price)
+        primal, dual = rows.longest_steps(*pair, self.ds, self.dt, self.dmultiplier, keep)
+        if abs(self.dT) * primal > LARGEST_CHANGE * self.T:
+            primal = LARGEST_CHANGE * self.T / abs(self.dT)
+        return primal, dual
+
+    def _mehrotra_step(self, mean: float) -> None:
+        """Full step to the boundary; the barrier parameter is the cube of what the step for μ = 0 would leave."""
+        after, _ = self._complementarity(*self._lengths(1.0))
+        floor = 0.1 * self.settings.tolerance * self.unit / self.s.size
+        mu = max(min((after / mean) ** 3, 1.0) * mean, floor)
+        self._direction(mu, corrected=True)
+        primal, dual = self._lengths(KEEP)
+        self.x_new[:] = self.x
+        self.x_new += primal * self.dx
+        self.T += primal * self.dT
+        self.model.values(self.x_new, self.T, self.g)
+        steps = (self.ds, self.dt, primal, self.price, mu)
+        rows.moved_slacks(self.g, self.s, self.t, *steps, self.s_new, self.t_new)
+        self._accept(dual, mu, 0.0)
+
+    def _armijo_step(self, objective: float) -> bool:
+        """A step of the barrier problem for the present μ; False if rounding allows no descent."""
+        model, mu = self.model, self.mu
+        products = self.s.size * mu
+        decrement = self._direction(mu, corrected=False)
+        mean, _ = self._complementarity(0.0, 0.0)
+        # y = 0: the right-hand side is then minus the gradient of the objective.
+        by_T = model.descent(self.zero, self.rhs)
+        slope = -float(np.vdot(self.rhs, self.dx)) - by_T * self.dT
+        slope += rows.barrier_slope(self.s, self.t, self.ds, self.dt, self.price, mu)
+        merit = model.factor * objective + rows.barrier(self.s, self.t, self.price, mu)
+        length, dual = self._lengths(KEEP)
+        while length > SHORTEST:
+            np.multiply(self.dx, length, out=self.x_new)
+            self.x_new += self.x
+            T = self.T + length * self.dT
+            objective = model.values(self.x_new, T, self.g_new)
+            steps = (self.ds, self.dt, length, self.price, mu)
+            rows.moved_slacks(self.g_new, self.s, self.t, *steps, self.s_new, self.t_new)
+            trial = model.factor * objective + rows.barrier(self.s_new, self.t_new, self.price, mu)
+            if trial <= merit + ARMIJO * length * slope + ROUNDING * abs(merit):
+                break
+            length /= 2
+        else:
+            return False
+        self.T = T
+        self._accept(dual, mu, SPREAD)
+        if decrement + abs(mean * self.s.size - products) <= products:
+            least = 1e-3 * self.settings.tolerance * self.unit / self.s.size
+            self.mu = max(min(0.2 * mu, mu**1.5), least)
+        return True
+
+    def _accept(self, dual: float, mu: float, spread: float) -> None:
+        """Move to the new point; arrays change places, so that nothing is copied."""
+        self.x, self.x_new = self.x_new, self.x
+        self.s, self.s_new = self.s_new, self.s
+        self.t, self.t_new = self.t_new, self.t
+        rows.move_multipliers(self.multiplier, self.dmultiplier, dual, self.s, self.t, self.price, mu, spread)

@@ -1,0 +1,187 @@
+"""Objective, and the matrix of the Newton system: Hessian of the Lagrangian plus Jᵀ Ω J, as band, column of T and corner.
+
+At one grid point everything depends on u = (q, v) through the constraints' rows and on q, w, a and T through boxes and
+objective. With v = a / T² the chain rule takes second derivatives by (q, v) to those by (q, a, T); the three-tap filter takes
+them to the unknowns x.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, TAPS
+from dyngrasp.signals import Array
+
+
+@njit(cache=True, error_model="numpy")
+def objective(a: Array, T: float, rho: float) -> float:
+    """T + ρ Δt Σ |v|² = T + ρ / (N T³) Σ |a|² of a (N+1, n)."""
+    effort = 0.0
+    for k in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            effort += a[k, j] * a[k, j]
+    return T + rho / (a.shape[0] - 1) / T**3 * effort
+
+
+@njit(cache=True, error_model="numpy")
+def add_objective_gradient(a: Array, T: float, rho: float, factor: float, dual: Array) -> float:
+    """Add factor · ∂f/∂a to dual[CURVATURE] (N+1, n); return factor · ∂f/∂T."""
+    K, n = a.shape
+    weight = factor * rho / (K - 1) / T**3
+    effort = 0.0
+    for k in range(K):
+        for j in range(n):
+            effort += a[k, j] * a[k, j]
+            dual[CURVATURE, k, j] += 2 * weight * a[k, j]
+    return factor - 3 * weight / T * effort
+
+
+@njit(cache=True, error_model="numpy")
+def assemble(
+    z: Array,
+    T: float,
+    v: Array,
+    omega: Array,
+    multiplier: Array,
+    weights: Array,
+    jacobian: Array,
+    hessian: Array,
+    limits: tuple,
+    rho: float,
+    factor: float,
+    shift: float,
+    first: Array,
+    taps: Array,
+    slope: Array,
+    band: Array,
+    column: Array,
+) -> float:
+    """Write the band and the column of T; return the corner.
+
+    Args:
+        z: (3, K, n) q, w, a.
+        T: Duration (s).
+        v: (K, n) a / T².
+        omega, multiplier: (K · R + 2,) Ω and λ of the one-sided rows.
+        weights: (K, m) from `limit_rows.constraint_weights` of λ.
+        jacobian, hessian: (K, m, 2n) and (K, 2n, 2n): derivatives of c, and of Σ weights · c, by (q, v).
+        limits: `LimitRows.arguments`.
+        rho: Weight of the effort.
+        factor: Weight of the objective, 1, or 0 where only the violation counts.
+        shift: Multiple of the identity added to the second derivatives by a: the inertia correction.
+        first, taps, slope: The map of `ThreeTap`.
+        band: ((K−2) n, 3n), overwritten; layout as in `banded`.
+        column: ((K−2) n,), overwritten.
+    """
+    _, half_width, velocity, acceleration, lo, up, _, _, scale, free, _, longest, fixed = limits
+    _, K, n = z.shape
+    m = jacobian.shape[1]
+    R = (omega.size - 2) // K
+    T2 = T * T
+    effort = factor * rho / (K - 1) / (T2 * T)
+    band[:] = 0.0
+    column[:] = 0.0
+    corner = 0.0 if fixed else (omega[omega.size - 2] + omega[omega.size - 1]) / longest**2
+
+    G = np.empty((2 * n, 2 * n))  # by (q, v)
+    qq, qa, aq, aa = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    ww = np.empty(n)
+    qT, wT, aT = np.empty(n), np.empty(n), np.empty(n)
+    row_stiffness = np.empty(m)
+    by_v = np.empty(n)
+
+    for k in range(K):
+        end = k == 0 or k == K - 1
+        at = k * R
+        boxes = at + 4 * n + 2 * acceleration.size
+
+        for i in range(m):
+            row_stiffness[i] = 0.0
+        for i in range(lo.size):
+            row_stiffness[lo[i]] += omega[boxes + i]
+        for i in range(up.size):
+            row_stiffness[up[i]] += omega[boxes + lo.size + i]
+        for j in range(n):
+            by_v[j] = 0.0
+        for i in range(2 * n):
+            for j in range(2 * n):
+                G[i, j] = -hessian[k, i, j]
+        for r in range(m):
+            if end and free[r] == 0.0:
+                continue
+            stiff = row_stiffness[r] * scale[r] * scale[r]
+            for i in range(2 * n):
+                here = stiff * jacobian[k, r, i]
+                for j in range(2 * n):
+                    G[i, j] += here * jacobian[k, r, j]
+            for j in range(n):
+                by_v[j] += weights[k, r] * jacobian[k, r, n + j]
+
+        for i in range(n):
+            qT[i], aT[i] = 0.0, 0.0
+            for j in range(n):
+                qq[i, j] = G[i, j]
+                qa[i, j] = G[i, n + j] / T2
+                aq[i, j] = G[n + i, j] / T2
+                aa[i, j] = G[n + i, n + j] / (T2 * T2)
+        for i in range(n):
+            # ∂v/∂T = −2 v / T; second derivatives of v times the rows' multipliers enter with the sign of −λ g.
+            for j in range(n):
+                dv = -2.0 / T * v[k, j]
+                qT[i] += G[i, n + j] * dv
+                aT[i] += G[n + i, n + j] * dv
+            corner += aT[i] * (-2.0 / T * v[k, i]) - 6.0 / T2 * by_v[i] * v[k, i]
+            a = z[CURVATURE, k, i]
+            aT[i] = aT[i] / T2 + 2.0 / (T2 * T) * by_v[i] - 6.0 * effort / T * a
+            aa[i, i] += 2.0 * effort + shift
+            corner += 12.0 * effort / T2 * a * a
+            if end:
+                ww[i], wT[i] = 0.0, 0.0
+                continue
+            qq[i, i] += (omega[at + i] + omega[at + n + i]) / half_width[i] ** 2
+            plus, minus = omega[at + 2 * n + i], omega[at + 3 * n + i]
+            ww[i] = (plus + minus) / velocity[i] ** 2
+            wT[i] = (plus - minus) / velocity[i]
+            corner += plus + minus
+        for i in range(acceleration.size):
+            plus, minus = omega[at + 4 * n + i], omega[at + 5 * n + i]
+            aa[i, i] += (plus + minus) / acceleration[i] ** 2
+            aT[i] += 2.0 * T * (plus - minus) / acceleration[i]
+            corner += 4.0 * T2 * (plus + minus)
+            corner -= 2.0 * (multiplier[at + 4 * n + i] + multiplier[at + 5 * n + i])
+
+        if k <= 2 or k >= K - 3:
+            # Near the ends q, w and a depend on T themselves.
+            for i in range(n):
+                q, w, a = slope[POSITION, k, i], slope[RATE, k, i], slope[CURVATURE, k, i]
+                corner += 2.0 * (q * qT[i] + w * wT[i] + a * aT[i]) + w * w * ww[i]
+                for j in range(n):
+                    q_j, a_j = slope[POSITION, k, j], slope[CURVATURE, k, j]
+                    corner += q * (qq[i, j] * q_j + 2.0 * qa[i, j] * a_j) + a * aa[i, j] * a_j
+            for i in range(n):
+                wT[i] += ww[i] * slope[RATE, k, i]
+                for j in range(n):
+                    qT[i] += qq[i, j] * slope[POSITION, k, j] + qa[i, j] * slope[CURVATURE, k, j]
+                    aT[i] += aq[i, j] * slope[POSITION, k, j] + aa[i, j] * slope[CURVATURE, k, j]
+
+        for b in range(TAPS):
+            q_b, w_b, a_b = taps[k, b, POSITION], taps[k, b, RATE], taps[k, b, CURVATURE]
+            if q_b == 0.0 and w_b == 0.0 and a_b == 0.0:
+                continue
+            row = (first[k] + b) * n
+            for i in range(n):
+                column[row + i] += q_b * qT[i] + w_b * wT[i] + a_b * aT[i]
+            for e in range(b + 1):
+                q_e, w_e, a_e = taps[k, e, POSITION], taps[k, e, RATE], taps[k, e, CURVATURE]
+                cqq, cqa, caq, caa = q_b * q_e, q_b * a_e, a_b * q_e, a_b * a_e
+                col = (first[k] + e) * n
+                for j in range(n):
+                    # Entry (row + i, col + j) lies in band[col + j, row + i − col − j], contiguous in i. The block is
+                    # read by rows of its transpose, for qq and aa are symmetric and qa and aq are each other's transpose.
+                    start = j if e == b else 0
+                    d = row - col - j
+                    for i in range(start, n):
+                        band[col + j, d + i] += cqq * qq[j, i] + cqa * aq[j, i] + caq * qa[j, i] + caa * aa[j, i]
+                    band[col + j, d + j] += w_b * w_e * ww[j]
+    return corner

@@ -1,0 +1,162 @@
+"""One phase as an interior point method sees it: f(x, T), rows g(x, T) ≥ 0, their derivatives, and the Newton system."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dyngrasp.planning.collocation import banded, limit_rows, newton_matrix, three_tap
+from dyngrasp.planning.collocation.limit_rows import LimitRows
+from dyngrasp.planning.collocation.node_functions import NodeFunctions, node_functions
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, ThreeTap
+from dyngrasp.planning.problem import PhaseProblem
+from dyngrasp.signals import Array
+
+
+class WorkArrays:
+    """Memory of one problem structure, used again by every problem that shares it.
+
+    Args:
+        points: K = N + 1.
+        joints: n.
+        constraint_rows: m, rows c of the constraints at a grid point.
+        rows_per_point: R, one-sided rows at a grid point.
+    """
+
+    def __init__(self, points: int, joints: int, constraint_rows: int, rows_per_point: int) -> None:
+        K, n, m = points, joints, constraint_rows
+        self.rows = K * rows_per_point + 2
+        unknowns = (K - 2) * n
+        self.z, self.dz, self.dual = (np.zeros((3, K, n)) for _ in range(3))
+        self.v = np.zeros((K, n))
+        self.c, self.weights, self.y_weights = (np.zeros((K, m)) for _ in range(3))
+        self.jacobian, self.hessian = np.zeros((K, m, 2 * n)), np.zeros((K, 2 * n, 2 * n))
+        self.band, self.column, self.solved_column = np.zeros((unknowns, 3 * n)), np.zeros(unknowns), np.zeros(unknowns)
+
+
+class PhaseModel:
+    """Functions of one problem at a current point; all results are written into given or internal arrays.
+
+    Attributes:
+        factor: Weight of the objective: 1, or 0 where only the violation is minimised.
+        corner: Entry of T in the Newton matrix.
+    """
+
+    def __init__(self, problem: PhaseProblem, work: dict[tuple, WorkArrays]) -> None:
+        self.problem = problem
+        self.functions: list[NodeFunctions] = [node_functions(c) for c in problem.constraints]
+        self.limits = LimitRows.of(problem, self.functions)
+        self.map = ThreeTap.of(problem)
+        self.factor = 1.0
+        shape = problem.intervals + 1, problem.joints, self.limits.constraint_rows, self.limits.rows_per_point
+        if shape not in work:
+            work[shape] = WorkArrays(*shape)
+        self.work = work[shape]
+        self._arguments = self.limits.arguments
+        self._T = 1.0
+
+    @property
+    def rows(self) -> int:
+        """Number of one-sided rows."""
+        return self.work.rows
+
+    def _place(self, x: Array, T: float) -> None:
+        work, tap = self.work, self.map
+        three_tap.expand(tap.first, tap.taps, tap.offset, tap.slope, x, T, work.z)
+        np.divide(work.z[CURVATURE], T * T, out=work.v)
+        self._T = T
+
+    def values(self, x: Array, T: float, g: Array) -> float:
+        """Move to a point, write its rows g, and return the objective."""
+        self._place(x, T)
+        work, column = self.work, 0
+        for constraint, function in zip(self.problem.constraints, self.functions, strict=True):
+            function.values(work.z[POSITION], work.v, constraint.parameters, work.c, column)
+            column += function.rows
+        limit_rows.row_values(work.z, T, work.c, self._arguments, g)
+        return newton_matrix.objective(work.z[CURVATURE], T, self.problem.effort_weight)
+
+    def violation_at_the_ends(self) -> tuple[float, str]:
+        """Worst violation of rows that the boundary positions alone decide, at the current point, and their name."""
+        work, limits, column = self.work, self.limits, 0
+        found = (0.0, "")
+        for constraint, function in zip(self.problem.constraints, self.functions, strict=True):
+            here = slice(column, column + function.rows)
+            g = work.c[[0, -1], here] * limits.inverse_scale[here]
+            outside = np.maximum(limits.lower[here] - g, g - limits.upper[here])[:, ~function.depends_on_acceleration]
+            worst = float(outside.max(initial=0.0))
+            if not worst <= found[0]:
+                found = (worst, constraint.name)
+            column += function.rows
+        return found
+
+    def derivatives(self, x: Array, T: float, multiplier: Array, g: Array) -> float:
+        """As `values`, and prepare everything below for this point and these multipliers."""
+        self._place(x, T)
+        work, column = self.work, 0
+        limit_rows.constraint_weights(multiplier, self._arguments, work.weights)
+        work.hessian[:] = 0.0
+        for constraint, function in zip(self.problem.constraints, self.functions, strict=True):
+            function.derivatives(
+                work.z[POSITION],
+                work.v,
+                constraint.parameters,
+                work.weights,
+                work.c,
+                work.jacobian,
+                work.hessian,
+                column,
+            )
+            column += function.rows
+        limit_rows.row_values(work.z, T, work.c, self._arguments, g)
+        return newton_matrix.objective(work.z[CURVATURE], T, self.problem.effort_weight)
+
+    def descent(self, y: Array, out: Array) -> float:
+        """Write −∇f + Jᵀ y by x into `out` (N−1, n), return it by T."""
+        work, tap = self.work, self.map
+        work.dual[:] = 0.0
+        limit_rows.constraint_weights(y, self._arguments, work.y_weights)
+        by_T = limit_rows.rows_transposed(y, self._T, work.v, work.jacobian, self._arguments, work.y_weights, work.dual)
+        rho = self.problem.effort_weight
+        by_T += newton_matrix.add_objective_gradient(work.z[CURVATURE], self._T, rho, -self.factor, work.dual)
+        return by_T + three_tap.pull_back(tap.first, tap.taps, tap.slope, work.dual, out)
+
+    def row_steps(self, dx: Array, dT: float, dg: Array) -> None:
+        """Write J d."""
+        work, tap = self.work, self.map
+        three_tap.expand_step(tap.first, tap.taps, tap.slope, dx, dT, work.dz)
+        limit_rows.row_steps(work.dz, dT, self._T, work.v, work.jacobian, self._arguments, dg)
+
+    def factorise(self, omega: Array, multiplier: Array, shift: float) -> bool:
+        """Assemble and factorise H + Jᵀ Ω J + shift · ∂²|a|²/2; whether the banded part is positive definite."""
+        work, tap = self.work, self.map
+        self.corner = newton_matrix.assemble(
+            work.z,
+            self._T,
+            work.v,
+            omega,
+            multiplier,
+            work.weights,
+            work.jacobian,
+            work.hessian,
+            self._arguments,
+            self.problem.effort_weight,
+            self.factor,
+            shift,
+            tap.first,
+            tap.taps,
+            tap.slope,
+            work.band,
+            work.column,
+        )
+        if not banded.cholesky(work.band):
+            return False
+        self.complement = banded.schur_complement(work.band, work.column, self.corner, work.solved_column)
+        return bool(np.isfinite(self.complement))
+
+    def solve(self, x: Array, by_T: float) -> float:
+        """Overwrite a right-hand side x (N−1, n) by the solution; return its last unknown, the step of T."""
+        work = self.work
+        if self.limits.fixed_duration:
+            banded.solve_in_place(work.band, x.ravel())
+            return 0.0
+        return banded.solve_bordered(work.band, work.solved_column, self.complement, x.ravel(), by_T)
