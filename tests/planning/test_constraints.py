@@ -148,9 +148,7 @@ def test_derivatives_match_finite_differences(iiwa, sdh2, T_flange_grasp, states
     here, step = np.concatenate([states[0][0], states[1][0]]), 1e-6
 
     def slope(function):
-        columns = [
-            (function(here + step * e) - function(here - step * e)) / (2 * step) for e in np.eye(14)
-        ]
+        columns = [(function(here + step * e) - function(here - step * e)) / (2 * step) for e in np.eye(14)]
         return np.array(columns).T
 
     expected = slope(lambda at: ca.evalf(constraint.function(at[:7], at[7:], constraint.parameters[0])).full().ravel())

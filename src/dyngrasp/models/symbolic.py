@@ -161,7 +161,8 @@ def full_inverse_dynamics(robot: RobotModel) -> ca.Function:
 def payload_wrench(robot: RobotModel) -> ca.Function:
     """(q (n,), v (n,), payload (10,)) → force (3,), moment (3,) about the flange origin, in flange axes (N, Nm).
 
-    What the flange exerts on a payload for q̈ = v at q̇ = 0, its weight included: the last link of the recursion of `torque`.
+    What the flange exerts on a payload for q̈ = v at q̇ = 0, its weight included: the last link of the recursion of
+    `torque`.
     """
 
     def build() -> ca.Function:

@@ -1,7 +1,8 @@
 """The constraints of the three phases, each written once as a symbolic function of one grid point.
 
-Whatever a pose, a part or a gripper changes is a parameter: one function serves an arm for good, so that derivatives and
-compiled code are made once. Functions are kept in `RobotModel.symbolic_cache`, which copies with other payloads share.
+Whatever a pose, a part or a gripper changes is a parameter: one function serves an arm for good, so that derivatives
+and compiled code are made once. Functions are kept in `RobotModel.symbolic_cache`, which copies with other payloads
+share.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ def torque_rows(robot: RobotModel, intervals: int, fraction: float = 1.0) -> Nod
     if not (bound > 0).all():
         i = int(bound.argmin())
         raise InvalidProblem(
-            f"{fraction:g} of the torque limit {robot.limits.torque[i]:g} Nm of {robot.joint_names[i]} is less than the bound "
-            f"of its Coriolis torque, {robot.limits.coriolis[i]:g} Nm"
+            f"{fraction:g} of the torque limit {robot.limits.torque[i]:g} Nm of {robot.joint_names[i]} is less than "
+            f"the bound of its Coriolis torque, {robot.limits.coriolis[i]:g} Nm"
         )
     payload = _at_each(symbolic.payload_vector(robot.payload), intervals)
     return NodeConstraint("torque", symbolic.torque(robot), payload, -bound, bound, robot.limits.torque)
@@ -51,9 +52,9 @@ def funnel(
 ) -> NodeConstraint:
     """G stays above the inverted Gaussian, eqs. (6) and (7): h = z − z_th (1 − exp(−½ (x²/σx² + y²/σy²))) ≥ 0.
 
-    Above z_th it holds by itself, so that one row serves the whole approach. Equivalent rows with a gentler wall (h over
-    the length of its gradient, logarithms) converge worse, see decision 0003; what h needs is a start that
-    already comes down the funnel.
+    Above z_th it holds by itself, so that one row serves the whole approach. Equivalent rows with a gentler wall (h
+    over the length of its gradient, logarithms) converge worse, see decision 0003; what h needs is a start that already
+    comes down the funnel.
 
     Args:
         robot: The arm.
@@ -74,7 +75,7 @@ def funnel(
         return ca.Function("funnel", [q, v, p], [h], ["q", "v", "p"], ["g"])
 
     function = _cached(robot, "funnel", build)
-    return NodeConstraint("funnel", function, parameters, [margin], [np.inf], [shape.z_threshold])
+    return NodeConstraint("funnel", function, parameters, _bound(margin), _bound(np.inf), _bound(shape.z_threshold))
 
 
 def grasp_tube(
@@ -88,16 +89,17 @@ def grasp_tube(
 ) -> NodeConstraint:
     """While the hand closes, G stays on the grasp axis and the hand in its orientation.
 
-    Rows: x² + y² ≤ lateral² and z ≥ −dip of G in the grasp frame, and 3 − trace(R) = 4 sin²(θ/2) for the angle θ between
-    the hand and the grasp frame. The squares are smooth on the axis itself, where the motion begins and ends.
+    Rows: x² + y² ≤ lateral² and z ≥ −dip of G in the grasp frame, and 3 − trace(R) = 4 sin²(θ/2) for the angle θ
+    between the hand and the grasp frame. The squares are smooth on the axis itself, where the motion begins and ends.
 
     Args:
         robot: The arm.
         p_flange_grasp: (N+1, 3) G in the flange frame (m): it moves as the fingers close.
         R_flange_grasp: (3, 3) axes of the hand's grasp frame in the flange frame.
         T_world_grasp: The grasp frame.
-        lateral, dip: Distances (m), > 0.
-        tilt: Angle (rad), > 0.
+        lateral: How far G may leave the grasp axis (m), > 0.
+        dip: How far G may pass below the grasp frame (m), > 0.
+        tilt: How far the hand may turn against the grasp frame (rad), > 0.
     """
     points = _points(p_flange_grasp)
     fixed = np.concatenate([np.asarray(R_flange_grasp, dtype=float).ravel(), _frame(T_world_grasp)])
@@ -116,9 +118,9 @@ def grasp_tube(
         "grasp_tube",
         function,
         parameters,
-        [-np.inf, -dip, -np.inf],
-        [lateral**2, np.inf, twist],
-        [lateral**2, dip, twist],
+        _bound(-np.inf, -dip, -np.inf),
+        _bound(lateral**2, np.inf, twist),
+        _bound(lateral**2, dip, twist),
     )
 
 
@@ -134,11 +136,11 @@ def hold(
 ) -> NodeConstraint:
     """The pinch carries the part: friction and torsion of two pads under the part's acceleration.
 
-    The wrench that the part needs at G is taken with q̇ = 0, as in the torque rows. Its force f_t in the plane across the
-    closing axis and its moment m_n about that axis stay within the ellipse
-    (f_t / (2 μ N))² + (m_n / (2 t N))² ≤ 1 / safety², a convex approximation of the limit surface of two pads that press
-    with N each. Along the closing axis the force only shifts load between the pads: |f_y| ≤ closing_share · N. Moments
-    across the closing axis are left to the width of the pads.
+    The wrench that the part needs at G is taken with q̇ = 0, as in the torque rows. Its force f_t in the plane
+    across the closing axis and its moment m_n about that axis stay within the ellipse (f_t / (2 μ N))² + (m_n / (2
+    t N))² ≤ 1 / safety², a convex approximation of the limit surface of two pads that press with N each. Along the
+    closing axis the force only shifts load between the pads: |f_y| ≤ closing_share · N. Moments across the closing
+    axis are left to the width of the pads.
 
     Args:
         robot: The arm.
@@ -174,9 +176,8 @@ def hold(
     function = _cached(robot, "hold", build)
     limit = 1 / safety**2
     parameters = _at_each(numbers, intervals)
-    return NodeConstraint(
-        "hold", function, parameters, [-np.inf, -closing_share], [limit, closing_share], [limit, closing_share]
-    )
+    upper = _bound(limit, closing_share)
+    return NodeConstraint("hold", function, parameters, _bound(-np.inf, -closing_share), upper, upper)
 
 
 def above_ground(robot: RobotModel, points: ArrayLike, intervals: int, depth: float = 1e-4) -> NodeConstraint:
@@ -212,7 +213,8 @@ def holding_margin(part: pin.Inertia, T_world_grasp: pin.SE3, friction: Friction
     Args:
         part: Inertia of the part in the grasp frame.
         T_world_grasp: The grasp frame, y along the closing axis.
-        friction, pinch_force: As in `hold`.
+        friction: As in `hold`.
+        pinch_force: As in `hold` (N).
 
     Raises:
         GraspRefused: 2 t N < 2 m g d with d the lever of the weight about the closing axis: the part would turn in the
@@ -223,8 +225,8 @@ def holding_margin(part: pin.Inertia, T_world_grasp: pin.SE3, friction: Friction
     capacity = 2 * friction.torsional * pinch_force
     if capacity < 2 * abs(moment):
         raise GraspRefused(
-            f"the pinch holds {capacity:.3f} Nm of torsion; the part's weight asks {abs(moment):.3f} Nm about the closing "
-            f"axis, and twice that is needed"
+            f"the pinch holds {capacity:.3f} Nm of torsion; the part's weight asks {abs(moment):.3f} Nm about the "
+            f"closing axis, and twice that is needed"
         )
     slip, twist, _ = _inverse_capacities(friction, pinch_force)
     return float(1 / np.hypot(slip * np.hypot(weight[0], weight[2]), twist * moment))
@@ -269,3 +271,7 @@ def _points(p_flange_grasp: ArrayLike) -> Array:
 
 def _at_each(numbers: Array, intervals: int) -> Array:
     return np.tile(numbers, (intervals + 1, 1))
+
+
+def _bound(*values: float) -> Array:
+    return np.array(values)

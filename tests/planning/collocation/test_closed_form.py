@@ -135,7 +135,7 @@ def test_rest_to_rest_is_exact_and_odd(N):
 def test_rest_to_rest_tends_to_the_cubic():
     s = np.linspace(0, 1, 1001)
     position, rate, curvature = rest_to_rest(1000)
-    # The discrete minimiser differs from the cubic 3 s² − 2 s³ by terms of order h² and, at the ends' halved weights, h.
+    # The discrete minimiser differs from the cubic by terms of order h, from the halved weights at its ends.
     np.testing.assert_allclose(position, 3 * s**2 - 2 * s**3, atol=2e-3)
     np.testing.assert_allclose(rate, 6 * s - 6 * s**2, atol=6e-3)
     np.testing.assert_allclose(curvature[1:-1], (6 - 12 * s)[1:-1], atol=2e-2)

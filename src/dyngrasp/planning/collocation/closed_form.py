@@ -109,9 +109,9 @@ def least_cost(problem: PhaseProblem, duration: float) -> float:
 
 
 def best_duration(problem: PhaseProblem) -> float:
-    """The duration within its bounds that minimises J(T): an end of the interval or a root of the quartic
+    """The duration within its bounds that minimises J(T).
 
-    T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
+    An end of the interval or a root of the quartic T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
     """
     return _best_root(effort_coefficients(problem), problem)[0]
 

@@ -50,7 +50,8 @@ def gripper_path(start: ArrayLike, end: ArrayLike, intervals: int) -> GripperPat
     """The motion of least Σ|q̈_h|² between two postures at rest.
 
     Args:
-        start, end: (m,) postures (rad).
+        start: (m,) posture at s = 0 (rad).
+        end: (m,) posture at s = 1 (rad).
         intervals: N ≥ 2.
     """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)

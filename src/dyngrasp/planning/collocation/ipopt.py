@@ -95,7 +95,9 @@ class IpoptSolver:
         curvature, duration = transcription.unpack(x, problem.intervals)
         if not (np.isfinite(curvature).all() and np.isfinite(duration) and duration > 0):
             timings["total"] = sum(timings.values())
-            return Solution(Status.NONFINITE, None, np.nan, iterations, np.inf, timings, f"{problem.name}: IPOPT: {code}")
+            return Solution(
+                Status.NONFINITE, None, np.nan, iterations, np.inf, timings, f"{problem.name}: IPOPT: {code}"
+            )
         trajectory = nearest_trajectory(problem, curvature, duration)
         violation, worst = worst_violation(problem, trajectory)
         message = f"{problem.name}: IPOPT: {code}"

@@ -33,7 +33,8 @@ class CollocationSettings:
         velocity_fraction, torque_fraction: Parts of the limits that a plan may use; the rest serves the controller,
             which has to track the plan with a model that is not exact.
         position_margin: Distance kept from the position limits (rad), less where a boundary state is closer.
-        funnel_margin: h ≥ this at the grid points of the approach (m), because between them the hand cuts corners.
+        funnel_margin: h ≥ this at the grid points of the approach (m) at N = 100, because between them the hand cuts
+            corners: by up to 1.3 mm, and by the square of the step on other grids.
         hold_safety: Factor by which the pinch exceeds what the part asks of it while it is carried.
         max_duration: Longest approach and longest delivery (s).
     """
@@ -59,7 +60,7 @@ class CollocationSettings:
 BACKENDS = {"ipopt": lambda: IpoptSolver(IpoptSettings())}
 """Solvers of one phase by name."""
 
-# Heights of the way points, in parts of z_th above the pre-grasp's own, and when they are passed, in parts of the descent.
+# Heights of the way points between the pre-grasp (0) and z_th (1), and so when they are passed before the end.
 _DESCENT_HEIGHTS = np.array([1.0, 0.62, 0.25])
 
 # Parts of the approach that the descent through the funnel may take; the cheapest of them is the start.
@@ -246,7 +247,8 @@ class CollocationPlanner:
         ends = np.vstack([problem.start_position, problem.end_position])
         at_ends = replace(funnel, parameters=funnel.parameters[[0, -1]])
         # A little less than the ends have, so that an interior point remains.
-        margin = min(self.settings.funnel_margin, 0.9 * float(rows(at_ends, ends, np.zeros_like(ends)).min()))
+        wanted = self.settings.funnel_margin * (100 / self.settings.intervals) ** 2
+        margin = min(wanted, 0.9 * float(rows(at_ends, ends, np.zeros_like(ends)).min()))
         return replace(funnel, lower=np.array([max(margin, 0.0)]))
 
     def _tube(self, targets: GraspTargets, path: GripperPath) -> NodeConstraint:

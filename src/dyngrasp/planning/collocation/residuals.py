@@ -25,7 +25,8 @@ def rows(constraint: NodeConstraint, position: Array, acceleration: Array) -> Ar
 
     Args:
         constraint: With parameters for the same K points.
-        position, acceleration: (K, n) in rad and rad/s².
+        position: (K, n) in rad.
+        acceleration: (K, n) in rad/s².
     """
     key = (constraint.function.__hash__(), len(position))
     # The function is kept beside its map: a hash is only good as long as what it names is alive.

@@ -175,9 +175,7 @@ def numbers(problem: PhaseProblem) -> dict[str, Array]:
     """Parameters and bounds of one problem: p, lbx, ubx, lbg, ubg."""
     N, n = problem.intervals, problem.joints
     acceleration_limit = np.where(np.isfinite(problem.acceleration_limit), problem.acceleration_limit, 1e12)
-    limits = np.concatenate(
-        [problem.velocity_limit, acceleration_limit, [problem.effort_weight / N, 1.0 / (N + 1)]]
-    )
+    limits = np.concatenate([problem.velocity_limit, acceleration_limit, [problem.effort_weight / N, 1.0 / (N + 1)]])
     columns = [np.tile(limits, (N + 1, 1))]
     for constraint in problem.constraints:
         columns += [constraint.parameters, np.tile(constraint.scale, (N + 1, 1))]
