@@ -17,11 +17,16 @@ from dyngrasp.planning.problem import NodeConstraint, Status
 FEASIBLE = 1e-7
 
 
+def bounds(lower: float, upper: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lower and upper bound of a single row and its scale, 1."""
+    return np.array([lower]), np.array([upper]), np.ones(1)
+
+
 def speed_rows(n: int, N: int, bound: float) -> NodeConstraint:
     """A nonlinear row on (q, v): q·q + 0.1 v·v ≤ bound."""
     q, v, p = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("p", 1)
     row = ca.Function("row", [q, v, p], [ca.sumsqr(q) + p * ca.sumsqr(v)])
-    return NodeConstraint("row", row, np.full((N + 1, 1), 0.1), [-np.inf], [bound], [1.0])
+    return NodeConstraint("row", row, np.full((N + 1, 1), 0.1), *bounds(-np.inf, bound))
 
 
 def check(problem, solution):
@@ -187,7 +192,7 @@ class TestFailuresAreData:
         problem = make_problem(0)
         bound = problem.end_position[0]
         for lower, status in ((bound + 1e-3, Status.INFEASIBLE), (min(bound, problem.start_position[0]) - 1e-3, None)):
-            rows = NodeConstraint("wall", row, np.zeros((101, 0)), [lower], [np.inf], [1.0])
+            rows = NodeConstraint("wall", row, np.zeros((101, 0)), *bounds(lower, np.inf))
             solution = solver.solve(make_problem(0, constraints=(rows,)))
             assert solution.status is (status or Status.CONVERGED)
             assert ("wall" in solution.message) == (status is Status.INFEASIBLE)
@@ -197,6 +202,7 @@ class TestFailuresAreData:
         solution = IpoptSolver(IpoptSettings(max_iterations=2)).solve(problem)
         assert solution.status is Status.ITERATION_LIMIT
         assert solution.iterations == 2
+        assert solution.trajectory is not None
         assert solution.trajectory.dynamics_defect() < 1e-12
 
     def test_deadline(self, make_problem):
@@ -207,7 +213,7 @@ class TestFailuresAreData:
     def test_a_row_that_is_not_finite(self, make_problem, solver):
         q, v, p = ca.SX.sym("q", 7), ca.SX.sym("v", 7), ca.SX.sym("p", 0)
         row = ca.Function("row", [q, v, p], [ca.sqrt(-1 - ca.sumsqr(v))])
-        rows = NodeConstraint("row", row, np.zeros((101, 0)), [-1.0], [1.0], [1.0])
+        rows = NodeConstraint("row", row, np.zeros((101, 0)), *bounds(-1.0, 1.0))
         solution = solver.solve(make_problem(0, constraints=(rows,)))
         assert solution.status is Status.NONFINITE
         assert solution.worst_violation == np.inf

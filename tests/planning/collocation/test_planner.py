@@ -1,4 +1,4 @@
-"""Whole plans of the iiwa with the SDH2 and the casting: three phases, one clock, and an audit that has the last word."""
+"""Whole plans of the iiwa with the SDH2 and the casting: three phases, one clock, and the audit's last word."""
 
 from dataclasses import replace
 
@@ -71,6 +71,7 @@ def test_grasp_takes_as_long_as_the_hand_needs(result, targets, task):
 def test_approach_starts_from_a_guess_down_the_funnel(planner, targets):
     approach, grasp, deliver = planner.phase_problems(Q_START, targets)
     guess = planner.guess(approach, targets)
+    assert guess is not None
     assert guess.dynamics_defect() < 1e-12
     only_funnel = replace(
         approach,
@@ -110,7 +111,7 @@ def test_a_phase_without_time_stops_the_plan_there(task, targets):
 def test_a_hand_too_slow_for_the_grasp_is_refused_in_numbers(iiwa, sdh2, task, targets):
     settings = TaskSettings(grasp_duration_min=0.1, grasp_duration_max=0.2)
     quick = GraspTask(iiwa, sdh2, task.grasp_object, Q_PLACE, settings)
-    with pytest.raises(InvalidProblem, match="needs 0.5"):
+    with pytest.raises(InvalidProblem, match=r"needs 0\.5"):
         CollocationPlanner(quick).phase_problems(Q_START, targets)
 
 

@@ -167,7 +167,7 @@ def _nonzeros(function: ca.Function, points: int, *arguments: ca.MX) -> ca.MX:
     """Nonzeros of the one sparse output of `function`, one grid point after another, as a column."""
     inputs = [ca.SX.sym(f"i{i}", function.size1_in(i)) for i in range(function.n_in())]
     (output,) = function.call(inputs)
-    flat = ca.Function(function.name() + "_nonzeros", inputs, [ca.vertcat(*output.nonzeros())])
+    flat = ca.Function(function.name() + "_nonzeros", inputs, [output.nz[:]])
     return ca.vec(flat.map(points)(*arguments))
 
 
