@@ -71,7 +71,7 @@ def test_duration_is_the_best_of_a_scan(make_problem, weight):
         k = int(np.clip(np.argmin(costs), 1, scan.size - 2))
         refined = fminbound(lambda T, p=problem: least_cost(p, T), scan[k - 1], scan[k + 1])
         # A minimum is flat: a search that stops at 1e-5 in T is off by 1e-10 in the cost.
-        assert least_cost(problem, duration) <= min(least_cost(problem, float(refined)), *costs) + 1e-9
+        assert least_cost(problem, duration) <= min(least_cost(problem, np.asarray(refined).item()), *costs) + 1e-9
         assert 0.05 <= duration <= 20.0
 
 
