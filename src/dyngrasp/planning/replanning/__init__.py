@@ -1,0 +1,1 @@
+"""The online replanner: a new trajectory from a new pose within milliseconds, never late, never invalid."""

@@ -1,0 +1,183 @@
+"""All motions that obey the trapezoidal rule between two boundary states, as one free sequence a joint.
+
+With s = t/T, w = T q̇, a = T² q̈ and h = 1/N the trapezoidal rule, eq. (3b), has as its solutions exactly the three-tap
+filters of a sequence r[−1 … N+1],
+
+    q[k] = (r[k−1] + 2 r[k] + r[k+1]) / 4,   w[k] = (r[k+1] − r[k−1]) / (2 h),   a[k] = (r[k+1] − 2 r[k] + r[k−1]) / h².
+
+Position and velocity at an end fix the two neighbours of r[0] (of r[N]) by r[±1] = 2 q − r[0] ± h T q̇. Where the acceleration is
+given as well, as at a splice, it fixes r[0] = q − h² T² q̈ / 4 too. The unknowns are x = (r[0], r[2], …, r[N−2], r[N]),
+N − 1 a joint, of which the first or the last may be held.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numba import njit
+
+from dyngrasp.signals import Array
+
+POSITION, RATE, CURVATURE = 0, 1, 2
+TAPS = 3
+
+
+@lru_cache(maxsize=64)
+def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -> tuple[Array, Array, Array]:
+    """How grid points depend on the unknowns, and the bands of Σ_k zᵀz.
+
+    Args:
+        intervals: N ≥ 4.
+        hold_start, hold_end: Whether r[0] and r[N] are given.
+        ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
+
+    Returns:
+        `first` (N+1,), index of the first unknown of a grid point; `taps` (N+1, 3, 3), coefficients [k, tap, q/w/a] with zeros
+        at held unknowns; `bands` (3, N−1, 3), lower bands [q/w/a, column, diagonal] of Σ_k tap tapᵀ.
+    """
+    N, h = intervals, 1.0 / intervals
+    size = N - 1
+    weights = np.array([[0.25, -0.5 / h, 1 / h**2], [0.5, 0.0, -2 / h**2], [0.25, 0.5 / h, 1 / h**2]])
+    rows = np.zeros((N + 1, size, 3))
+    column = {0: 0, N: size - 1} | {i: i - 1 for i in range(2, N - 1)}
+    mirrored = {-1: 0, 1: 0, N - 1: size - 1, N + 1: size - 1}
+    for k in range(N + 1):
+        for step in (-1, 0, 1):
+            i = k + step
+            if i in mirrored:
+                # r[±1] = … − r[0]: an eliminated value counts for its neighbour at the end, with the opposite sign.
+                rows[k, mirrored[i]] -= weights[step + 1]
+            else:
+                rows[k, column[i]] += weights[step + 1]
+    if hold_start:
+        rows[:, 0] = 0.0
+    if hold_end:
+        rows[:, -1] = 0.0
+    first = np.clip(np.arange(N + 1) - 2, 0, size - TAPS)
+    taps = np.stack([rows[k, first[k] : first[k] + TAPS] for k in range(N + 1)])
+    counted = slice(None) if ends_cost else slice(1, N)
+    bands = np.zeros((3, size, TAPS))
+    for kind in range(3):
+        gram = rows[counted, :, kind].T @ rows[counted, :, kind]
+        for d in range(TAPS):
+            bands[kind, : size - d, d] = np.diagonal(gram, -d)
+    for array in (first, taps, bands):
+        array.setflags(write=False)
+    return first, taps, bands
+
+
+@njit(cache=True, error_model="numpy")
+def sequence(x: Array, T: float, ends: Array, hold_start: bool, hold_end: bool, r: Array) -> None:
+    """Write r (N+3, n) from the unknowns x (N−1, n), T and `ends` (2, 3, n): position, velocity, acceleration at both."""
+    size, n = x.shape
+    N = size + 1
+    h = 1.0 / N
+    for i in range(1, size - 1):
+        for j in range(n):
+            r[i + 2, j] = x[i, j]
+    for j in range(n):
+        r0, rN = x[0, j], x[size - 1, j]
+        if hold_start:
+            r0 = ends[0, 0, j] - h * h * T * T * ends[0, 2, j] / 4
+        if hold_end:
+            rN = ends[1, 0, j] - h * h * T * T * ends[1, 2, j] / 4
+        r[1, j], r[N + 1, j] = r0, rN
+        r[0, j] = 2 * ends[0, 0, j] - r0 - h * T * ends[0, 1, j]
+        r[2, j] = 2 * ends[0, 0, j] - r0 + h * T * ends[0, 1, j]
+        r[N, j] = 2 * ends[1, 0, j] - rN - h * T * ends[1, 1, j]
+        r[N + 2, j] = 2 * ends[1, 0, j] - rN + h * T * ends[1, 1, j]
+
+
+@njit(cache=True, error_model="numpy")
+def sequence_by_duration(T: float, ends: Array, hold_start: bool, hold_end: bool, r: Array) -> None:
+    """Write ∂r/∂T (N+3, n) at constant x: zero but at three places at either end."""
+    points, n = r.shape
+    N = points - 3
+    h = 1.0 / N
+    r[:] = 0.0
+    for j in range(n):
+        d0 = -h * h * T * ends[0, 2, j] / 2 if hold_start else 0.0
+        dN = -h * h * T * ends[1, 2, j] / 2 if hold_end else 0.0
+        r[1, j], r[N + 1, j] = d0, dN
+        r[0, j], r[2, j] = -d0 - h * ends[0, 1, j], -d0 + h * ends[0, 1, j]
+        r[N, j], r[N + 2, j] = -dN - h * ends[1, 1, j], -dN + h * ends[1, 1, j]
+
+
+@njit(cache=True, error_model="numpy")
+def filtered(r: Array, z: Array) -> None:
+    """Write q, w, a (3, N+1, n) of a sequence r (N+3, n)."""
+    _, K, n = z.shape
+    half_rate, curvature = 0.5 * (K - 1), float((K - 1) * (K - 1))
+    for k in range(K):
+        for j in range(n):
+            before, here, after = r[k, j], r[k + 1, j], r[k + 2, j]
+            z[0, k, j] = 0.25 * (before + after) + 0.5 * here
+            z[1, k, j] = half_rate * (after - before)
+            z[2, k, j] = curvature * ((after - here) - (here - before))
+
+
+@njit(cache=True, error_model="numpy")
+def pull_back(first: Array, taps: Array, dual: Array, gradient: Array) -> None:
+    """Overwrite `gradient` (N−1, n) by the derivatives by x of Σ dual · z, `dual` (3, N+1, n)."""
+    _, K, n = dual.shape
+    gradient[:] = 0.0
+    for k in range(K):
+        for b in range(TAPS):
+            q, w, a = taps[k, b, 0], taps[k, b, 1], taps[k, b, 2]
+            i = first[k] + b
+            for j in range(n):
+                gradient[i, j] += q * dual[0, k, j] + w * dual[1, k, j] + a * dual[2, k, j]
+
+
+@njit(cache=True, error_model="numpy")
+def push_forward(first: Array, taps: Array, dx: Array, z: Array) -> None:
+    """Add the change of q, w, a with dx (N−1, n) to z (3, N+1, n)."""
+    _, K, n = z.shape
+    for k in range(K):
+        for b in range(TAPS):
+            q, w, a = taps[k, b, 0], taps[k, b, 1], taps[k, b, 2]
+            i = first[k] + b
+            for j in range(n):
+                value = dx[i, j]
+                z[0, k, j] += q * value
+                z[1, k, j] += w * value
+                z[2, k, j] += a * value
+
+
+@njit(cache=True, error_model="numpy")
+def factorise(band: Array) -> None:
+    """Replace bands (N−1, 3, n) of n pentadiagonal matrices by L and D⁻¹ of L D Lᵀ; joints lie side by side."""
+    size, _, n = band.shape
+    for i in range(size):
+        for j in range(n):
+            inverse = 1.0 / band[i, 0, j]
+            below, second = band[i, 1, j], band[i, 2, j]
+            l1, l2 = below * inverse, second * inverse
+            band[i, 0, j], band[i, 1, j], band[i, 2, j] = inverse, l1, l2
+            if i + 1 < size:
+                band[i + 1, 0, j] -= l1 * below
+                band[i + 1, 1, j] -= l1 * second
+            if i + 2 < size:
+                band[i + 2, 0, j] -= l2 * second
+
+
+@njit(cache=True, error_model="numpy")
+def substitute(band: Array, x: Array) -> None:
+    """Overwrite the right-hand sides x (N−1, n) by the solutions."""
+    size, n = x.shape
+    for i in range(size - 1):
+        for j in range(n):
+            x[i + 1, j] -= band[i, 1, j] * x[i, j]
+        if i + 2 < size:
+            for j in range(n):
+                x[i + 2, j] -= band[i, 2, j] * x[i, j]
+    for i in range(size - 1, -1, -1):
+        for j in range(n):
+            x[i, j] *= band[i, 0, j]
+        if i + 1 < size:
+            for j in range(n):
+                x[i, j] -= band[i, 1, j] * x[i + 1, j]
+        if i + 2 < size:
+            for j in range(n):
+                x[i, j] -= band[i, 2, j] * x[i + 2, j]

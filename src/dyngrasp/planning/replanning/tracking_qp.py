@@ -1,0 +1,191 @@
+"""The online quadratic program (14) in the variables of scaled time, where its step is exact.
+
+The paper's step (δq, δq̇, δv, δT) and the step (δq, δw, δa, δT) of w = T q̇, a = T² v are related by
+
+    δw = T* δq̇ + q̇* δT,      δa = T*² δv + 2 T* v* δT,
+
+which turns the linearised dynamics (12) into the exact ones: they are linear in (q, w, a) and free of T. So both are one program, with the same
+weights and the same minimiser; but a step taken in (q, w, a) obeys the trapezoidal rule to rounding, while the paper's update (15) drops the
+products of deviations. For given δT the program falls apart into one pentadiagonal system a joint.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dyngrasp.errors import InvalidProblem
+from dyngrasp.planning.problem import MIN_INTERVALS, Status
+from dyngrasp.planning.replanning import tracking_kernel
+from dyngrasp.planning.replanning.box_rows import INFEASIBLE, ITERATION_LIMIT, NONFINITE, OPTIMAL, UNBOUNDED
+from dyngrasp.planning.replanning.joint_splines import filters
+from dyngrasp.signals import Array
+from dyngrasp.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class TrackingWeights:
+    """Weights of eq. (14), the same for all grid points.
+
+    With position and rate weights of zero the step is the smoothest one: the correction spreads over the whole horizon and has
+    almost arrived when the hand comes down the funnel. Weight on the position delays it to the end, where the funnel is narrow.
+
+    Attributes:
+        position: Q_q (1/rad²).
+        velocity: Q_q̇ (s²/rad²).
+        acceleration: Q_v (s⁴/rad²), > 0: it makes the program strictly convex.
+        duration: Q_ΔT (1/s²), > 0.
+    """
+
+    position: float = 0.0
+    velocity: float = 0.0
+    acceleration: float = 1.0
+    duration: float = 100.0
+
+    def __post_init__(self) -> None:
+        valid = self.position >= 0 and self.velocity >= 0 and self.acceleration > 0 and self.duration > 0
+        if not (valid and np.isfinite([self.position, self.velocity, self.acceleration, self.duration]).all()):
+            raise InvalidProblem(f"weights must be ≥ 0, those of acceleration and duration > 0; got {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingProblem:
+    """What is asked of one phase.
+
+    Attributes:
+        reference: ξ*, on the grid of the answer; it need not meet the boundary states nor obey the dynamics exactly.
+        start, end: (3, n) position (rad), velocity (rad/s) and acceleration (rad/s²) there.
+        hold_start_acceleration, hold_end_acceleration: Whether the accelerations are given; if not, they are ignored.
+        position_lower, position_upper: (n,) limits (rad).
+        velocity_limit, acceleration_limit: (n,) limits, +inf where there is none.
+        min_duration, max_duration: Bounds of ΔT (s), 0 < min ≤ max < ∞; equal ones fix it.
+        weights: Of the deviations.
+        paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the answer then is the linear model of the
+            motion, with a trajectory that has the defect of eq. (15).
+    """
+
+    reference: Trajectory
+    start: Array
+    end: Array
+    hold_start_acceleration: bool
+    hold_end_acceleration: bool
+    position_lower: Array
+    position_upper: Array
+    velocity_limit: Array
+    acceleration_limit: Array
+    min_duration: float
+    max_duration: float
+    weights: TrackingWeights = field(default_factory=TrackingWeights)
+    paper_rows: bool = False
+
+    def __post_init__(self) -> None:
+        n = self.reference.position.shape[1]
+        if self.reference.intervals < MIN_INTERVALS:
+            raise InvalidProblem(f"at least {MIN_INTERVALS} grid intervals, got {self.reference.intervals}")
+        if np.shape(self.start) != (3, n) or np.shape(self.end) != (3, n):
+            raise InvalidProblem(f"states of shape (3, {n}) expected, got {np.shape(self.start)}, {np.shape(self.end)}")
+        if not 0 < self.min_duration <= self.max_duration < np.inf:
+            raise InvalidProblem(f"durations 0 < min ≤ max < ∞ expected: {self.min_duration}, {self.max_duration} s")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingSolution:
+    """Answer to a `TrackingProblem`.
+
+    Attributes:
+        status: `converged`, or why not.
+        duration: ΔT (s).
+        scaled: (3, N+1, n) q (rad), w = T q̇ and a = T² q̈ (rad).
+        iterations: Of the interior point method; 0 where no box is active.
+        rows: Codes of the rows that were imposed, see `box_rows`.
+        multipliers: Their multipliers and those of the two bounds of ΔT.
+        elapsed_ms: Wall time of the solution (ms).
+    """
+
+    status: Status
+    duration: float
+    scaled: Array
+    iterations: int
+    rows: Array
+    multipliers: Array
+    elapsed_ms: float
+
+    def trajectory(self, problem: TrackingProblem) -> Trajectory:
+        """The motion in real time, its boundary states those of the problem to the last digit."""
+        T = self.duration
+        position = self.scaled[0].copy()
+        velocity, acceleration = self.scaled[1] / T, self.scaled[2] / T**2
+        for k, state, held in (
+            (0, problem.start, problem.hold_start_acceleration),
+            (-1, problem.end, problem.hold_end_acceleration),
+        ):
+            position[k], velocity[k] = state[0], state[1]
+            if held:
+                acceleration[k] = state[2]
+        return Trajectory(T, position, velocity, acceleration)
+
+
+_STATUS = {
+    OPTIMAL: Status.CONVERGED,
+    INFEASIBLE: Status.INFEASIBLE,
+    ITERATION_LIMIT: Status.ITERATION_LIMIT,
+    NONFINITE: Status.NONFINITE,
+}
+
+_DURATION_SLACK = 1e-12  # an interval of durations narrower than this is a point
+
+
+def solve_tracking(problem: TrackingProblem, max_iterations: int = 40) -> TrackingSolution:
+    """Solve the program; never raises for numerical reasons.
+
+    Args:
+        problem: What is asked.
+        max_iterations: Of each run of the interior point method.
+    """
+    began = time.perf_counter()
+    reference = problem.reference
+    N, n = reference.intervals, reference.position.shape[1]
+    motion = np.empty((3, N + 1, n))
+    motion[0], motion[1], motion[2] = reference.position, reference.velocity, reference.acceleration
+    ends = np.empty((2, 3, n))
+    ends[0], ends[1] = problem.start, problem.end
+    held = (problem.hold_start_acceleration, problem.hold_end_acceleration)
+    w = problem.weights
+    weights = np.empty((3, n))
+    weights[0], weights[1], weights[2] = w.position, w.velocity, w.acceleration
+    boxes = np.empty((4, n))
+    boxes[0], boxes[1] = problem.position_lower, problem.position_upper
+    boxes[2], boxes[3] = problem.velocity_limit, problem.acceleration_limit
+    np.clip(boxes, -UNBOUNDED, UNBOUNDED, out=boxes)
+    first, taps, bands = filters(N, *held, not problem.paper_rows)
+    scaled = np.empty((3, N + 1, n))
+    codes = np.empty(6 * (N + 1) * n + 8, dtype=np.int64)
+    multipliers = np.empty(codes.size + 2)
+    outcome, duration, iterations, count = tracking_kernel.solve(
+        motion,
+        reference.duration,
+        ends,
+        held,
+        weights,
+        w.duration,
+        not problem.paper_rows,
+        boxes,
+        problem.paper_rows,
+        (problem.min_duration, problem.max_duration),
+        first,
+        taps,
+        bands,
+        max_iterations,
+        scaled,
+        codes,
+        multipliers,
+    )
+    status = _STATUS[outcome]
+    if not (np.isfinite(duration) and duration > 0 and np.isfinite(scaled).all()):
+        status = Status.NONFINITE
+    elapsed = 1e3 * (time.perf_counter() - began)
+    return TrackingSolution(
+        status, duration, scaled, iterations, codes[:count].copy(), multipliers[: count + 2].copy(), elapsed
+    )
