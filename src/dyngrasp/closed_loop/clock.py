@@ -33,8 +33,8 @@ class Tick:
 class Clock:
     """Iterates over the ticks of an episode.
 
-    A slower rate need not divide the control rate: its event falls on the first tick at or after its due time, so the mean
-    rate is kept (30 Hz on a 1 kHz clock comes every 33 or 34 ticks).
+    A slower rate need not divide the control rate: its event falls on the first tick at or after its due time, so the
+    mean rate is kept (30 Hz on a 1 kHz clock comes every 33 or 34 ticks).
 
     Attributes:
         period: Control period (s).

@@ -43,7 +43,7 @@ class ComputedTorqueSettings:
 
 
 class ComputedTorque:
-    """τ = M(q) (q̈_plan + K_p e + K_d ė + K_i ∫e) + C(q, q̇_plan) q̇_plan + g(q) + learnt friction, within the motors' limits.
+    """τ = M(q) (q̈_plan + K_p e + K_d ė + K_i ∫e) + C(q, q̇_plan) q̇_plan + g(q) + learnt friction, within the limits.
 
     Args:
         robot_empty: The arm with the hand as its payload.

@@ -23,28 +23,30 @@ class GripperControlSettings:
         contact_force: Pad force that counts as contact (N): above what a bump of the tactile signal gives, well below
             a pinch.
         over_close: How far the pads are asked to go beyond where the plan closes them (m, each): it keeps the position
-            loop pressing; more would leave it saturated, and a saturated loop has no stiffness against sideways forces.
+            loop pressing, and lets the second pad reach a part that lies off its expected place by as much; more would
+            leave the loop saturated, and a saturated loop has no stiffness against sideways forces.
         force_fraction: Share of the torque limit that the squeeze takes; the rest is left to the position loop, which
             holds the part sideways.
-        ramp: Time over which the squeeze rises (s). At once, it would kick the part; slower, the lift begins without it.
+        ramp: Time over which the squeeze rises (s). At once, it would kick the part; slower, the lift begins before it.
         velocity_time_constant: T₁ of the differential filter (s).
     """
 
     bandwidth: float = 50.0
     damping: float = 0.8
     contact_force: float = 0.5
-    over_close: float = 1e-3
-    force_fraction: float = 0.7
+    over_close: float = 1.5e-3
+    force_fraction: float = 0.8
     ramp: float = 0.08
     velocity_time_constant: float = PAPER_TIME_CONSTANT
 
 
 class GripperController:
-    """PD about the planned posture with inertia, damping and weight of the fingers fed forward; a squeeze after contact.
+    """PD about the planned posture, with the fingers' inertia, damping and weight fed forward; a squeeze after contact.
 
-    Contact is when every pad feels the part, or when the planned closing has ended. From then on the pads' planned gap is
-    reduced by `over_close` on each side and a feed-forward that presses them together along the closing axis ramps up.
-    Torques never pass the limits of the hand.
+    From the first touch of a pad on, the planned gap is reduced by `over_close` on each side, so that the other pad
+    comes to the part too. Once every pad feels it, a feed-forward that presses the pads together along the closing axis
+    ramps up. Both begin when the planned closing has ended, whatever the pads feel. Torques never pass the limits of
+    the hand.
 
     Args:
         gripper: The hand.
@@ -62,6 +64,7 @@ class GripperController:
         self._joint_damping = np.array(gripper.pin_model.damping)[self._columns]
         self._filter = VelocityFilter(self.settings.velocity_time_constant, dt)
         self._planned = VelocityFilter(self.settings.velocity_time_constant, dt)
+        self._touch_since: float | None = None
         self._squeeze_since: float | None = None
         self.velocity = np.zeros(gripper.m)
 
@@ -70,13 +73,14 @@ class GripperController:
         """Whether the hand presses."""
         return self._squeeze_since is not None
 
-    def command(self, observation: Observation, sample: PlanSample, R_world_hand: Array) -> Array:
+    def command(self, observation: Observation, sample: PlanSample, specific_force: Array) -> Array:
         """Torques for this control period.
 
         Args:
             observation: Joint positions and pad forces now.
             sample: What the plan asks for now.
-            R_world_hand: (3, 3) attitude of the hand, for the weight of the fingers.
+            specific_force: (3,) acceleration of the hand minus that of gravity, in hand axes (m/s²): what an
+                accelerometer in the palm would read, and what the fingers weigh by.
 
         Returns:
             (m,) torques within the limits (Nm).
@@ -86,24 +90,30 @@ class GripperController:
         self.velocity = self._filter.update(q)
         self._watch_contact(observation, sample)
         target, squeeze = np.array(plan.position), np.zeros(gripper.m)
+        if self._touch_since is not None:
+            target = target + self._share(self._touch_since, sample.gripper.t) * self._over_closing(target)
         if self._squeeze_since is not None:
-            share = min((sample.gripper.t - self._squeeze_since) / s.ramp, 1.0)
-            target = target + share * self._over_closing(target)
-            squeeze = share * self._squeeze_torque(q)
+            squeeze = self._share(self._squeeze_since, sample.gripper.t) * self._squeeze_torque(q)
         error = target - q
         error_rate = self._planned.update(target) - self.velocity
         feedback = s.bandwidth**2 * error + 2 * s.damping * s.bandwidth * error_rate
         torque = self._inertia * (plan.acceleration + feedback) + self._joint_damping * plan.velocity
-        torque += self._weight(q, R_world_hand) + squeeze
+        torque += self._weight(q, specific_force) + squeeze
         return np.clip(torque, -gripper.torque, gripper.torque)
 
     def _watch_contact(self, observation: Observation, sample: PlanSample) -> None:
         if sample.phase == "approach":
-            self._squeeze_since = None
-        elif self._squeeze_since is None:
-            touched = bool((observation.pad_force > self.settings.contact_force).all())
-            if touched or sample.phase == "deliver":
-                self._squeeze_since = sample.gripper.t
+            self._touch_since = self._squeeze_since = None
+            return
+        touched = observation.pad_force > self.settings.contact_force
+        ended = sample.phase == "deliver"
+        if self._touch_since is None and (touched.any() or ended):
+            self._touch_since = sample.gripper.t
+        if self._squeeze_since is None and (touched.all() or ended):
+            self._squeeze_since = sample.gripper.t
+
+    def _share(self, since: float, t: float) -> float:
+        return min((t - since) / self.settings.ramp, 1.0)
 
     def _over_closing(self, posture: Array) -> Array:
         """(m,) step along the closing motion that brings each pad `over_close` further (rad)."""
@@ -114,7 +124,7 @@ class GripperController:
         return direction * (-2 * self.settings.over_close / slope)
 
     def _squeeze_torque(self, q: Array) -> Array:
-        """(m,) J_padᵀ F: the torques that press both pads together, the weakest joint at `force_fraction` of its limit."""
+        """(m,) J_padᵀ F: presses both pads together, the weakest joint at `force_fraction` of its limit."""
         gripper = self._gripper
         pin.computeJointJacobians(self._model, self._data, gripper.full_configuration(q))
         pin.updateFramePlacements(self._model, self._data)
@@ -128,8 +138,8 @@ class GripperController:
         scale = self.settings.force_fraction / np.max(np.abs(torque) / gripper.torque)
         return torque * min(scale, gripper.pinch_force)
 
-    def _weight(self, q: Array, R_world_hand: Array) -> Array:
-        self._model.gravity.linear = R_world_hand.T @ np.array([0.0, 0.0, -9.81])
+    def _weight(self, q: Array, specific_force: Array) -> Array:
+        self._model.gravity.linear = -specific_force
         weight = pin.computeGeneralizedGravity(self._model, self._data, self._gripper.full_configuration(q))
         return weight[self._columns].copy()
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTask
-from dyngrasp.signals import Array
 from dyngrasp.simulation.plant import ContactCategory
 from dyngrasp.trajectory import GraspPlan
 
@@ -254,8 +254,8 @@ def _clamp_delay(plan: GraspPlan, record: EpisodeRecord) -> float:
     return float(record.t[both.argmax()] - plan.phase_ends[1]) if both.any() else float("nan")
 
 
-def _both_pads(record: EpisodeRecord) -> Array:
-    return (record.pad_force > 0).all(axis=1)
+def _both_pads(record: EpisodeRecord) -> NDArray[np.bool_]:
+    return np.all(record.pad_force > 0, axis=1)
 
 
 def _angle_deg(a: pin.SE3, b: pin.SE3) -> float:

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from dyngrasp.simulation import gl_backend
 from dyngrasp.simulation.variation import PlantVariation
-
-gl_backend.choose()
-
-import mujoco  # noqa: E402 — the back end must be chosen before MuJoCo reads it
 
 if TYPE_CHECKING:
     from mujoco import MjModel, MjSpec
@@ -33,12 +29,13 @@ class SceneSettings:
     """Numerics of contact and integration, and the few physical facts that belong to no model file.
 
     Attributes:
-        timestep: Step of the integration (s). 1 ms resolves contacts of `contact_time`; a faster control rate sets it lower.
+        timestep: Step of the integration (s). 1 ms resolves contacts of `contact_time`; a faster control rate sets it
+            lower.
         contact_time: Time constant of contacts (s), MuJoCo's solref. MuJoCo's own default of 20 ms lets a pinched part
             creep by 7 mm or drop; 3 ms is stiff enough and more than twice the step, as MuJoCo needs it.
         impratio: Stiffness of friction over that of normal contact; with elliptic cones, 20 stops the creep.
         ground_friction: Cast metal on the ground, and the hand's metal on anything.
-        lock_stiffness: Of the servos that hold the joints which no plan moves (Nm/rad): a geared motor in position mode.
+        lock_stiffness: Of the servos that hold the joints which no plan moves (Nm/rad): geared motors in position mode.
         lock_torque: Their torque where the gripper's file states none (Nm).
     """
 
