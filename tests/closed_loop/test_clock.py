@@ -20,8 +20,8 @@ def test_slower_rates_keep_their_mean(period):
 
 
 def test_times_do_not_drift():
-    *_, last = Clock(1e-3, start=0.0, end=1000.0)
-    assert last.t == pytest.approx(999.999, abs=1e-9)
+    *_, last = Clock(1e-3, start=0.0, end=100.0)
+    assert last.t == pytest.approx(99.999, abs=1e-9)
 
 
 def test_a_rate_of_zero_never_comes():

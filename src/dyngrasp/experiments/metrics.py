@@ -43,12 +43,21 @@ class SuccessLimits:
 
 @dataclass(frozen=True)
 class Criterion:
-    """One criterion: its verdict, the measured numbers and, if it failed, the reason in words."""
+    """One criterion.
+
+    Attributes:
+        name: Which one.
+        passed: The verdict.
+        values: The measured numbers.
+        t: When it failed, or would have (s).
+        reason: In words.
+    """
 
     name: str
     passed: bool
     values: dict[str, float | bool]
-    reason: str = ""
+    t: float
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -56,8 +65,7 @@ class Outcome:
     """Verdict on an episode.
 
     Attributes:
-        criteria: In the order in which causes act: a part that was pushed away is also not lifted, not held and not
-            placed, and the first of these is the one to mend.
+        criteria: In the order of the table of criteria.
         worst: Largest ratio to the limit of each kind, in the plant: "position", "velocity", "torque_plant".
         details: Numbers that explain but decide nothing.
     """
@@ -73,8 +81,15 @@ class Outcome:
 
     @property
     def cause(self) -> str:
-        """The first criterion that failed, with its reason; "" after a success."""
-        return next((f"{c.name}: {c.reason}" for c in self.criteria if not c.passed), "")
+        """The criterion that failed first in time, with its reason; "" after a success.
+
+        A part that slips out also falls on something and lies in the wrong place; what came first is what to mend.
+        """
+        failed = [criterion for criterion in self.criteria if not criterion.passed]
+        if not failed:
+            return ""
+        first = min(failed, key=lambda criterion: criterion.t)
+        return f"{first.name}: {first.reason}"
 
     def summary(self) -> dict[str, Any]:
         """Values of all criteria and, under "passed", the verdict on each."""
@@ -110,7 +125,7 @@ def judge(
         _held(plan, record, limits),
         slip,
         _placed(plan, record, task, grasp, limits),
-        _within_limits(worst),
+        _within_limits(worst, float(record.t[-1])),
         _moving(plan, record, task, limits),
     )
     return Outcome(criteria, worst, {**details, **_tracking(plan, record)})
@@ -124,9 +139,9 @@ def _clear(record: EpisodeRecord) -> Criterion:
     }
     # A touch that lasts is one collision, however many samples it fills.
     collisions = sum(int(np.count_nonzero(np.diff(np.r_[False, touched].astype(int)) == 1)) for touched in hit.values())
-    first = {what: record.t[touched.argmax()] for what, touched in hit.items() if touched.any()}
+    first = {what: float(record.t[touched.argmax()]) for what, touched in hit.items() if touched.any()}
     reason = "; ".join(f"the robot hit {what} at {t:.2f} s" for what, t in first.items())
-    return Criterion("clear", collisions == 0, {"collisions": collisions}, reason)
+    return Criterion("clear", collisions == 0, {"collisions": collisions}, min(first.values(), default=np.inf), reason)
 
 
 def _undisturbed(
@@ -137,14 +152,15 @@ def _undisturbed(
     # Two points far apart: a push turns the part as well as it moves it, and one point may be where it turns about.
     points = np.array([grasp.T_object_grasp.translation, task.grasp_object.spatial_inertia.lever])
     before = record.T_world_part(0)
-    moved = max(
-        float(np.linalg.norm(record.T_world_part(k).act(p) - before.act(p))) for k in range(end + 1) for p in points
+    distance = 1e3 * np.array(
+        [max(np.linalg.norm(record.T_world_part(k).act(p) - before.act(p)) for p in points) for k in range(end + 1)]
     )
-    moved *= 1e3
+    moved, too_far = float(distance.max()), distance >= limits.disturbance_mm
     return Criterion(
         "undisturbed",
         moved < limits.disturbance_mm,
         {"undisturbed_mm": moved},
+        _first(record.t, too_far),
         f"the part was pushed {moved:.1f} mm before both pads were on it, limit {limits.disturbance_mm:g} mm",
     )
 
@@ -156,6 +172,7 @@ def _lifted(plan: GraspPlan, record: EpisodeRecord, limits: SuccessLimits) -> Cr
         "lifted",
         lifted,
         {"lifted": lifted},
+        float(record.t[at]),
         f"the part still touched the ground {limits.lift_delay:g} s after the grasp",
     )
 
@@ -164,8 +181,10 @@ def _held(plan: GraspPlan, record: EpisodeRecord, limits: SuccessLimits) -> Crit
     after = record.index_at(plan.phase_ends[1] + limits.lift_delay)
     dropped = record.touched(ContactCategory.PART_GROUND)[after:] | ~_both_pads(record)[after:]
     held = not bool(dropped.any())
-    t = float(record.t[after + int(dropped.argmax())])
-    return Criterion("held", held, {"held": held}, f"the part was not between the pads, off the ground, at {t:.2f} s")
+    t = _first(record.t[after:], dropped)
+    return Criterion(
+        "held", held, {"held": held}, t, f"the part was not between the pads, off the ground, at {t:.2f} s"
+    )
 
 
 def _slip(
@@ -176,15 +195,17 @@ def _slip(
     in_hand = [record.T_world_hand(k).actInv(record.T_world_part(k)) for k in range(first, len(record))]
     G_in_hand = np.array([record.T_world_hand(k).actInv(record.grasp_point[k]) for k in range(first, len(record))])
     at_grasp = np.array([T.act(p_object) for T in in_hand])
-    moved = float(np.linalg.norm(at_grasp - at_grasp[0], axis=1).max()) * 1e3
+    distance = np.linalg.norm(at_grasp - at_grasp[0], axis=1) * 1e3
     from_G = at_grasp - G_in_hand
     moved_from_G = float(np.linalg.norm(from_G - from_G[0], axis=1).max()) * 1e3
-    turned = max(_angle_deg(in_hand[0], T) for T in in_hand)
-    passed = moved < limits.slip_mm and turned < limits.slip_deg
+    angle = np.array([_angle_deg(in_hand[0], T) for T in in_hand])
+    moved, turned = float(distance.max()), float(angle.max())
+    slipped = (distance >= limits.slip_mm) | (angle >= limits.slip_deg)
     reason = (
         f"{moved:.1f} mm and {turned:.1f}° relative to the hand, limits {limits.slip_mm:g} mm and {limits.slip_deg:g}°"
     )
-    criterion = Criterion("slip", passed, {"slip_mm": moved, "slip_deg": turned}, reason)
+    t = _first(record.t[first:], slipped)
+    criterion = Criterion("slip", not slipped.any(), {"slip_mm": moved, "slip_deg": turned}, t, reason)
     return criterion, {"slip_from_grasp_point_mm": moved_from_G}
 
 
@@ -199,6 +220,7 @@ def _placed(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, grasp: Gras
         "placed",
         off < limits.place_mm and turned < limits.place_deg,
         {"place_mm": off, "place_deg": turned},
+        float(record.t[-1]),
         f"{off:.1f} mm and {turned:.1f}° from where the plan puts it, limits {limits.place_mm:g} mm and "
         f"{limits.place_deg:g}°",
     )
@@ -215,11 +237,13 @@ def _worst_ratios(record: EpisodeRecord, task: GraspTask) -> dict[str, float]:
     }
 
 
-def _within_limits(worst: dict[str, float]) -> Criterion:
+def _within_limits(worst: dict[str, float], t: float) -> Criterion:
     # The controller clips at the torque limit, so a ratio of 1 means saturation: the plan was not followable.
     passed = worst["position"] <= 1 and worst["velocity"] <= 1 and worst["torque_plant"] < 1
     name = max(worst, key=lambda kind: worst[kind])
-    return Criterion("limits", passed, {"limits_ratio": worst[name]}, f"{name} reached {worst[name]:.3f} of its limit")
+    return Criterion(
+        "limits", passed, {"limits_ratio": worst[name]}, t, f"{name} reached {worst[name]:.3f} of its limit"
+    )
 
 
 def _moving(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, limits: SuccessLimits) -> Criterion:
@@ -233,6 +257,7 @@ def _moving(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, limits: Suc
         "moving",
         slowest >= limits.speed_ratio,
         {"min_speed_ratio": slowest},
+        t,
         f"the arm all but stopped at {t:.2f} s: speed ratio {slowest:.4f}, least {limits.speed_ratio:g}",
     )
 
@@ -252,6 +277,10 @@ def _clamp_delay(plan: GraspPlan, record: EpisodeRecord) -> float:
     """When both pads first hold the part, relative to the planned grasp (s); NaN if they never do."""
     both = _both_pads(record)
     return float(record.t[both.argmax()] - plan.phase_ends[1]) if both.any() else float("nan")
+
+
+def _first(t: NDArray[np.float64], failed: NDArray[np.bool_]) -> float:
+    return float(t[failed.argmax()]) if failed.any() else float("inf")
 
 
 def _both_pads(record: EpisodeRecord) -> NDArray[np.bool_]:
