@@ -28,10 +28,10 @@ class View:
         fov_deg: Vertical field of view.
     """
 
-    lookat: tuple[float, float, float] = (0.30, 0.0, 0.42)
-    distance: float = 2.1
+    lookat: tuple[float, float, float] = (0.34, 0.0, 0.40)
+    distance: float = 1.8
     azimuth_deg: float = 132.0
-    elevation_deg: float = -16.0
+    elevation_deg: float = -18.0
     fov_deg: float = 38.0
 
 

@@ -150,7 +150,7 @@ def _set_stage(spec: MjSpec, settings: SceneSettings) -> None:
     visual.map.znear, visual.map.zfar = 0.02, 30.0
     visual.headlight.ambient, visual.headlight.diffuse = [0.32] * 3, [0.28] * 3
     visual.headlight.specular = [0.05] * 3
-    visual.rgba.haze = [0.86, 0.89, 0.92, 1.0]
+    visual.rgba.haze = [0.80, 0.84, 0.88, 1.0]
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -165,9 +165,9 @@ def _set_stage(spec: MjSpec, settings: SceneSettings) -> None:
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         mark=mujoco.mjtMark.mjMARK_EDGE,
-        rgb1=[0.80, 0.815, 0.83],
-        rgb2=[0.765, 0.78, 0.795],
-        markrgb=[0.70, 0.715, 0.73],
+        rgb1=[0.56, 0.59, 0.62],
+        rgb2=[0.525, 0.555, 0.585],
+        markrgb=[0.47, 0.50, 0.53],
         width=512,
         height=512,
     )
@@ -221,7 +221,7 @@ def _add_part(spec: MjSpec, grasp_object: GraspObject, variation: PlantVariation
     part.mass = inertia.mass * variation.mass_factor
     part.ipos = inertia.lever
     part.fullinertia = [I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]]
-    spec.add_material(name="cast_aluminium", rgba=[0.66, 0.67, 0.68, 1.0], specular=0.35, shininess=0.25)
+    spec.add_material(name="cast_aluminium", rgba=[0.72, 0.73, 0.74, 1.0], specular=0.5, shininess=0.35)
     spec.add_mesh(
         name="part_visual", file=str(grasp_object.mesh_path), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     )
