@@ -6,8 +6,8 @@
 The matrix is positive definite exactly if the factorisation of B succeeds and σ > 0. Work and memory grow linearly with
 the number of unknowns.
 
-Storage: `band[j, d]` is the entry in row j + d and column j, 0 ≤ d ≤ bandwidth, so that a column of the lower triangle lies
-contiguously and every inner loop below runs along it.
+Storage: `band[j, d]` is the entry in row j + d and column j, 0 ≤ d ≤ bandwidth, so that a column of the lower triangle
+lies contiguously and every inner loop below runs along it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ def solve_bordered(lower: Array, solved_column: Array, complement: float, x: Arr
 
     Args:
         lower: L from `cholesky`.
-        solved_column, complement: B⁻¹ c and σ from `schur_complement`.
+        solved_column: B⁻¹ c from `schur_complement`.
+        complement: σ from there.
         x: (size,) b, overwritten.
         beta: Last entry of the right-hand side.
 

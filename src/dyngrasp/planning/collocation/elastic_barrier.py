@@ -1,16 +1,17 @@
 """Slacks, elastic variables and multipliers of the rows g ≥ 0: what an interior point iteration does to each row.
 
 Every row may be violated at a price ν (Gould, Orban, Toint 2015, "An interior-point ℓ1-penalty method for nonlinear
-optimization"): g = s − t with s, t > 0, and ν t is added to the objective. The logarithmic barrier of s and t gives, for a
-barrier parameter μ,
+optimization"): g = s − t with s, t > 0, and ν t is added to the objective. The logarithmic barrier of s and t gives, for
+a barrier parameter μ,
 
     s λ = μ,      t (ν − λ) = μ,      s − t = g,
 
-λ the multiplier of g. A strictly positive s and t exists for every x, hence the iterates of this problem are always feasible
-and one merit function serves from the first iterate to the last. If λ < ν/2 at the solution, g = μ/λ − μ/(ν − λ) > 0: the
-solution for μ > 0 satisfies g ≥ 0 strictly.
+λ the multiplier of g. A strictly positive s and t exists for every x, hence the iterates of this problem are always
+feasible and one merit function serves from the first iterate to the last. If λ < ν/2, g = μ/λ − μ/(ν − λ) > 0: the
+solution for μ > 0 satisfies the row strictly.
 
-A Newton step on the three equations with dg = J d, right-hand sides corrected by e_s and e_t (Mehrotra's second-order terms):
+A Newton step on the three equations with dg = J d, right-hand sides corrected by e_s and e_t (Mehrotra's second-order
+terms):
 
     dλ = Ω (b − dg),   Ω = 1 / (s/λ + t/(ν − λ)),   b = (μ − e_s)/λ − (μ − e_t)/(ν − λ) − g,
     ds = (μ − e_s)/λ − s − s/λ dλ,                  dt = (μ − e_t)/(ν − λ) − t + t/(ν − λ) dλ.
@@ -51,7 +52,7 @@ def stiffness(s: Array, t: Array, multiplier: Array, price: float, omega: Array)
 def target_multipliers(
     s: Array, t: Array, multiplier: Array, price: float, mu: float, e_s: Array, e_t: Array, omega: Array, y: Array
 ) -> None:
-    """y = λ + Ω b: the multipliers after a Newton step that leaves the rows as they are."""
+    """Write y = λ + Ω b: the multipliers after a Newton step that leaves the rows as they are."""
     for i in range(s.size):
         b = (mu - e_s[i]) / multiplier[i] - (mu - e_t[i]) / (price - multiplier[i]) - (s[i] - t[i])
         y[i] = multiplier[i] + omega[i] * b

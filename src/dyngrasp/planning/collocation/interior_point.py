@@ -1,17 +1,20 @@
 """A primal-dual interior point method with elastic rows, in two modes.
 
 Free mode: Mehrotra's predictor–corrector chooses the barrier parameter anew in every iteration, and full steps to the
-boundary are taken as long as the error estimate E falls within a few iterations. Monotone mode: the barrier parameter is
-fixed until its problem is solved, and Armijo's rule on the barrier merit function accepts steps. The method falls
-back from the first to the second where E stalls, and returns when E has fallen again (Nocedal, Wächter, Waltz 2009,
-"Adaptive barrier update strategies for nonlinear interior methods"); in monotone mode every step is a descent step of a smooth
-function bounded below, hence the iterates approach its stationary points (Gould, Orban, Toint 2015, for elastic rows).
+boundary are taken as long as the error estimate E falls within a few iterations. Monotone mode: the barrier parameter
+is fixed until its problem is solved, and Armijo's rule on the barrier merit function accepts steps. Where a free step
+raises E it is taken back and the monotone mode goes on, until E has fallen by half (Nocedal, Wächter, Waltz 2009,
+"Adaptive barrier update strategies for nonlinear interior methods"). In monotone mode every step is a descent step of a
+smooth function bounded below, hence the iterates approach its stationary points (Gould, Orban, Toint 2015, for elastic
+rows). Where such a point violates a row, the violation alone is minimised; if it cannot be brought to zero the problem is
+reported as infeasible.
 
-The Newton matrix is made positive definite: the banded part by adding multiples of the second derivative of Σ|a|² until
-its Cholesky factorisation succeeds, the row of T by replacing a Schur complement that is not positive.
+The Newton matrix is made positive definite: the banded part by leaving out part of the curvature of the rows until its
+Cholesky factorisation succeeds, then by adding multiples of the second derivative of Σ|a|²; the row of T by replacing a
+Schur complement that is not positive.
 
-E = dᵀ K d + Σ s λ + Σ t (ν − λ), with d the step for μ = 0 and K the Newton matrix: near a solution twice what a full step
-lowers the objective by, plus the duality gap. It has the unit of the objective whatever the grid.
+E = dᵀ K d + Σ s λ + Σ t (ν − λ), with d the step for μ = 0 and K the Newton matrix: near a solution twice what a full
+step lowers the objective by, plus the duality gap. It has the unit of the objective whatever the grid.
 """
 
 from __future__ import annotations
@@ -45,7 +48,7 @@ class InteriorPointSettings:
     max_iterations: int = 200
     initial_barrier: float = 1e-3
     least_slack: float = 1e-2
-    price: float = 1e3
+    price: float = 3.0
 
 
 class Outcome(Enum):
@@ -69,6 +72,7 @@ class Best:
     violation: float = np.inf
 
     def offer(self, x: Array, T: float, objective: float, violation: float, tolerance: float) -> None:
+        """Keep an iterate if it is better than the one kept."""
         if not np.isfinite(objective + violation):
             return
         if violation <= tolerance:
@@ -82,13 +86,19 @@ class Best:
 KEEP = 0.995  # a step takes at most this share of a slack or multiplier
 MEMORY = 5  # iterations within which E must fall in free mode
 FALL = 0.9999  # by which factor
+ENOUGH = 0.5  # by which factor it must fall in monotone mode before the free one is tried again
 ARMIJO = 1e-4
 ROUNDING = 1e-13  # of the merit, relative
 SHORTEST = 1e-10  # step length at which the line search gives up
 SPREAD = 1e10  # multipliers stay within this factor of μ / s, as the convergence proof wants
 LARGEST_CHANGE = 0.7  # of T in one step, relative: 1/T³ knows nothing of the other side of zero
-DEARER = 100.0  # factor of ν after a feasible point was found that ν had not been high enough to find
+DEARER = 10.0  # factor of ν where it proves too low to enforce the rows
 STATIONARY = 1e-6  # E at a least violation, relative to the price of that violation
+LEAST_CURVATURE = 0.1  # part of the rows' curvature below which it is left out
+CLOSE = 0.3  # share of ν that a multiplier may reach before ν is raised
+DEAREST = 1e6  # largest ν, relative to the objective
+PATIENCE = 40  # iterations within which the violation must fall by the factor PROGRESS
+PROGRESS = 0.9
 ACCEPTABLE = 1e3  # multiple of the tolerance that counts as solved where rounding allows no further descent
 
 
@@ -108,7 +118,8 @@ class InteriorPoint:
         M = model.rows
         self.s, self.t, self.multiplier, self.ds, self.dt, self.dmultiplier = (np.zeros(M) for _ in range(6))
         self.g, self.dg, self.omega, self.y, self.e_s, self.e_t = (np.zeros(M) for _ in range(6))
-        self.s_new, self.t_new, self.g_new, self.zero = (np.zeros(M) for _ in range(4))
+        self.s_new, self.t_new, self.g_new, self.multiplier_old, self.zero = (np.zeros(M) for _ in range(5))
+        self.T_old = 0.0
 
     def solve(
         self, model: PhaseModel, x: Array, T: float, deadline: float, multiplier: Array | None = None
@@ -117,7 +128,8 @@ class InteriorPoint:
 
         Args:
             model: The problem.
-            x, T: Start.
+            x: Start, unknowns of `ThreeTap`.
+            T: Start, duration (s).
             deadline: A value of `time.perf_counter`; the best iterate until then is returned.
             multiplier: Multipliers of the rows at the solution of a problem nearby, for a warm start.
 
@@ -135,6 +147,7 @@ class InteriorPoint:
         self.price = settings.price * self.unit
         self.best = Best(self.x.copy(), T)
         self._restart(1.0, multiplier)
+        self.since = 0
         for iteration in range(settings.max_iterations + 1):
             objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
             violation = max(0.0, -float(self.g.min()))
@@ -146,7 +159,9 @@ class InteriorPoint:
                 # There is a feasible point after all: the price of a violation had been too low.
                 self.price *= DEARER
                 self._restart(1.0, None)
+                self.since = iteration
                 objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
+            self._raise_price()
             if not self._factorise():
                 return Outcome.NONFINITE, self.best, iteration
             decrement = self._direction(0.0, corrected=False)
@@ -156,18 +171,24 @@ class InteriorPoint:
                 return Outcome.NONFINITE, self.best, iteration
             if feasible and error <= settings.tolerance * self.unit:
                 return Outcome.OPTIMAL, self.best, iteration
-            if model.factor == 0.0 and error <= STATIONARY * self.price * violation:
-                return Outcome.INFEASIBLE, self.best, iteration
             if iteration == settings.max_iterations:
                 return Outcome.ITERATION_LIMIT, self.best, iteration
             if time.perf_counter() > deadline:
                 return Outcome.DEADLINE, self.best, iteration
-            if model.factor == 1.0 and not feasible and error <= settings.tolerance * self.price * violation:
+            stationary = error <= STATIONARY * self.price * violation
+            if violation < PROGRESS * self.least_violation:
+                self.least_violation, self.since = violation, iteration
+            hopeless = iteration - self.since >= PATIENCE
+            if not feasible and (stationary or hopeless):
+                if model.factor == 0.0:
+                    return Outcome.INFEASIBLE, self.best, iteration
                 # The cheapest point violates a row: is there any that does not?
                 self._restart(0.0, None)
+                self.since = iteration
                 continue
-            self._choose_mode(error, mean)
-            if self.free:
+            if not self._choose_mode(error, mean):
+                self._undo_step()
+            elif self.free:
                 self._mehrotra_step(mean)
             elif not self._armijo_step(objective):
                 if feasible and model.factor == 1.0:
@@ -185,18 +206,35 @@ class InteriorPoint:
         self.mu = settings.initial_barrier * self.unit
         self.model.values(self.x, self.T, self.g)
         rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
-        self.free, self.history, self.reference = True, [], np.inf
+        self.free, self.history, self.reference, self.mean = True, [], np.inf, self.mu
         self.last_shift = 0.0
+        self.least_violation = np.inf
 
-    def _choose_mode(self, error: float, mean: float) -> None:
-        recent = self.history[-MEMORY:]
-        if self.free and len(recent) == MEMORY and error > FALL * max(recent):
-            self.free, self.reference = False, FALL * max(recent)
-            self.mu = 0.8 * mean
-        elif not self.free and error <= self.reference:
-            self.free = True
-        if self.free:
-            self.history.append(error)
+    def _raise_price(self) -> None:
+        """Keep ν well above the multipliers: rows are then satisfied with strict inequality, and ν only counts beyond."""
+        if self.multiplier.max() > CLOSE * self.price and self.price < DEAREST * self.unit:
+            self.price *= DEARER
+            # Errors measured with the old price are of no use for comparison.
+            self.history, self.reference = [], np.inf
+
+    def _choose_mode(self, error: float, mean: float) -> bool:
+        """Decide between the modes; False if the last step was a free one that led astray."""
+        if not self.free and error <= self.reference:
+            self.free, self.history = True, []
+        if not self.free:
+            return True
+        if error > FALL * max(self.history[-MEMORY:], default=np.inf):
+            self.free, self.reference, self.mu = False, ENOUGH * self.history[-1], 0.8 * self.mean
+            return False
+        self.history.append(error)
+        self.mean = mean
+        return True
+
+    def _undo_step(self) -> None:
+        """Back to where the last free step began; the arrays of the new point still hold that point."""
+        self._exchange()
+        self.T, self.T_old = self.T_old, self.T
+        self.multiplier[:] = self.multiplier_old
 
     def _complementarity(self, primal: float, dual: float) -> tuple[float, float]:
         """Mean of s λ and sum of t (ν − λ) after steps of these lengths."""
@@ -208,9 +246,15 @@ class InteriorPoint:
         rows.stiffness(self.s, self.t, self.multiplier, self.price, self.omega)
         model = self.model
         unit = self.unit / (model.problem.intervals * self.T**2)
-        shift = 0.0
-        while not model.factorise(self.omega, self.multiplier, shift):
-            shift = 8.0 * shift if shift > 0 else max(self.last_shift / 3, 1e-6 * unit)
+        curvature, shift = 1.0, 0.0
+        while not model.factorise(self.omega, self.multiplier, curvature, shift):
+            # Without the curvature of the rows all that is left is convex but for T; with some of it steps are better.
+            if curvature > LEAST_CURVATURE:
+                curvature /= 4.0
+            elif curvature > 0:
+                curvature = 0.0
+            else:
+                shift = 8.0 * shift if shift > 0 else max(self.last_shift / 3, 1e-6 * unit)
             if shift > 1e20 * unit or not np.isfinite(model.corner):
                 return False
         if shift > 0:
@@ -257,8 +301,9 @@ class InteriorPoint:
         mu = max(min((after / mean) ** 3, 1.0) * mean, floor)
         self._direction(mu, corrected=True)
         primal, dual = self._lengths(KEEP)
-        self.x_new[:] = self.x
-        self.x_new += primal * self.dx
+        np.multiply(self.dx, primal, out=self.x_new)
+        self.x_new += self.x
+        self.multiplier_old[:], self.T_old = self.multiplier, self.T
         self.T += primal * self.dT
         self.model.values(self.x_new, self.T, self.g)
         steps = (self.ds, self.dt, primal, self.price, mu)
@@ -298,8 +343,12 @@ class InteriorPoint:
         return True
 
     def _accept(self, dual: float, mu: float, spread: float) -> None:
-        """Move to the new point; arrays change places, so that nothing is copied."""
+        """Move to the new point."""
+        self._exchange()
+        rows.move_multipliers(self.multiplier, self.dmultiplier, dual, self.s, self.t, self.price, mu, spread)
+
+    def _exchange(self) -> None:
+        """The new point becomes the present one and the other way round; nothing is copied."""
         self.x, self.x_new = self.x_new, self.x
         self.s, self.s_new = self.s_new, self.s
         self.t, self.t_new = self.t_new, self.t
-        rows.move_multipliers(self.multiplier, self.dmultiplier, dual, self.s, self.t, self.price, mu, spread)

@@ -247,7 +247,10 @@ def rows_transposed(y: Array, T: float, v: Array, jacobian: Array, limits: tuple
 
     Args:
         y: (K · R + 2,) factors of the rows.
-        T, v, jacobian, limits: As for `row_steps`.
+        T: As for `row_steps`, and so are the next three.
+        v: (K, n)
+        jacobian: (K, m, 2n)
+        limits: `LimitRows.arguments`.
         weights: (K, m) from `constraint_weights` of the same y.
         dual: (3, K, n), added to.
     """

@@ -1,8 +1,8 @@
-"""Objective, and the matrix of the Newton system: Hessian of the Lagrangian plus Jᵀ Ω J, as band, column of T and corner.
+"""Objective, and the matrix of the Newton system, Hessian of the Lagrangian plus Jᵀ Ω J: band, column of T, corner.
 
 At one grid point everything depends on u = (q, v) through the constraints' rows and on q, w, a and T through boxes and
-objective. With v = a / T² the chain rule takes second derivatives by (q, v) to those by (q, a, T); the three-tap filter takes
-them to the unknowns x.
+objective. With v = a / T² the chain rule takes second derivatives by (q, v) to those by (q, a, T); the three-tap filter
+takes them to the unknowns x.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ def assemble(
     limits: tuple,
     rho: float,
     factor: float,
+    curvature: float,
     shift: float,
     first: Array,
     taps: Array,
@@ -63,14 +64,19 @@ def assemble(
         z: (3, K, n) q, w, a.
         T: Duration (s).
         v: (K, n) a / T².
-        omega, multiplier: (K · R + 2,) Ω and λ of the one-sided rows.
+        omega: (K · R + 2,) Ω of the one-sided rows.
+        multiplier: (K · R + 2,) λ of the same.
         weights: (K, m) from `limit_rows.constraint_weights` of λ.
-        jacobian, hessian: (K, m, 2n) and (K, 2n, 2n): derivatives of c, and of Σ weights · c, by (q, v).
+        jacobian: (K, m, 2n) derivatives of c by (q, v).
+        hessian: (K, 2n, 2n) second derivatives of Σ weights · c by (q, v).
         limits: `LimitRows.arguments`.
         rho: Weight of the effort.
         factor: Weight of the objective, 1, or 0 where only the violation counts.
+        curvature: Part of the second derivatives of the rows to take, 1, or 0 for Gauss and Newton's matrix.
         shift: Multiple of the identity added to the second derivatives by a: the inertia correction.
-        first, taps, slope: The map of `ThreeTap`.
+        first: The map of `ThreeTap`, and so are the next two.
+        taps: (K, 3, 3)
+        slope: (3, K, n)
         band: ((K−2) n, 3n), overwritten; layout as in `banded`.
         column: ((K−2) n,), overwritten.
     """
@@ -106,7 +112,7 @@ def assemble(
             by_v[j] = 0.0
         for i in range(2 * n):
             for j in range(2 * n):
-                G[i, j] = -hessian[k, i, j]
+                G[i, j] = -curvature * hessian[k, i, j]
         for r in range(m):
             if end and free[r] == 0.0:
                 continue
@@ -116,7 +122,7 @@ def assemble(
                 for j in range(2 * n):
                     G[i, j] += here * jacobian[k, r, j]
             for j in range(n):
-                by_v[j] += weights[k, r] * jacobian[k, r, n + j]
+                by_v[j] += curvature * weights[k, r] * jacobian[k, r, n + j]
 
         for i in range(n):
             qT[i], aT[i] = 0.0, 0.0
@@ -149,7 +155,7 @@ def assemble(
             aa[i, i] += (plus + minus) / acceleration[i] ** 2
             aT[i] += 2.0 * T * (plus - minus) / acceleration[i]
             corner += 4.0 * T2 * (plus + minus)
-            corner -= 2.0 * (multiplier[at + 4 * n + i] + multiplier[at + 5 * n + i])
+            corner -= curvature * 2.0 * (multiplier[at + 4 * n + i] + multiplier[at + 5 * n + i])
 
         if k <= 2 or k >= K - 3:
             # Near the ends q, w and a depend on T themselves.
@@ -178,7 +184,7 @@ def assemble(
                 col = (first[k] + e) * n
                 for j in range(n):
                     # Entry (row + i, col + j) lies in band[col + j, row + i − col − j], contiguous in i. The block is
-                    # read by rows of its transpose, for qq and aa are symmetric and qa and aq are each other's transpose.
+                    # read by rows of its transpose: qq and aa are symmetric, qa and aq each other's transpose.
                     start = j if e == b else 0
                     d = row - col - j
                     for i in range(start, n):

@@ -1,7 +1,7 @@
-"""Rows of a `NodeConstraint`, their Jacobian and the Hessian of their weighted sum at all grid points, as compiled code.
+"""Rows of a `NodeConstraint`, their Jacobian and the Hessian of their weighted sum at all grid points, compiled.
 
-The derivatives are taken symbolically of one grid point; the C code that CasADi makes of them is compiled once for each arm
-and row and runs over the grid in a loop. Without a C compiler CasADi's virtual machine evaluates the same expressions.
+The derivatives are taken symbolically of one grid point; the C code that CasADi makes of them is compiled once for each
+arm and row and runs over the grid in a loop. Without a C compiler CasADi's virtual machine evaluates the same expressions.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class NodeFunctions(Protocol):
         """Write g (K, total) in columns `column` to `column + m`.
 
         Args:
-            q, v: (K, n) positions and accelerations, contiguous.
+            q: (K, n) positions, contiguous.
+            v: (K, n) accelerations, contiguous.
             p: (K, n_p) parameters.
             g: (K, total) rows of all constraints.
             column: Where the rows of this one begin.
@@ -50,10 +51,14 @@ class NodeFunctions(Protocol):
         """Write values and Jacobian, add the Hessian of Σ weights · g by (q, v).
 
         Args:
-            q, v, p, g, column: As for `values`.
-            weights: (K, total).
-            jacobian: (K, total, 2n).
+            q: As for `values`, and so are the next two.
+            v: (K, n)
+            p: (K, n_p)
+            weights: (K, total)
+            g: (K, total), written in the same columns.
+            jacobian: (K, total, 2n), written in the same rows.
             hessian: (K, 2n, 2n), added to.
+            column: As for `values`.
         """
         ...
 
@@ -176,7 +181,8 @@ class CompiledNodeFunctions:
 
 
 _LOOPS = """
-void values_over_grid(long long points, const double* q, const double* v, const double* p, double* g, long long total) {{
+void values_over_grid(long long points, const double* q, const double* v, const double* p, double* g,
+                      long long total) {{
   double w[{work_values} + 1];
   long long iw[{integers_values} + 1];
   for (long long k = 0; k < points; ++k) {{

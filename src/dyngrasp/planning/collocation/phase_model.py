@@ -1,4 +1,4 @@
-"""One phase as an interior point method sees it: f(x, T), rows g(x, T) ≥ 0, their derivatives, and the Newton system."""
+"""One phase as an interior point method sees it: f(x, T), rows g(x, T) ≥ 0, derivatives, and the Newton system."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class PhaseModel:
         three_tap.expand_step(tap.first, tap.taps, tap.slope, dx, dT, work.dz)
         limit_rows.row_steps(work.dz, dT, self._T, work.v, work.jacobian, self._arguments, dg)
 
-    def factorise(self, omega: Array, multiplier: Array, shift: float) -> bool:
+    def factorise(self, omega: Array, multiplier: Array, curvature: float, shift: float) -> bool:
         """Assemble and factorise H + Jᵀ Ω J + shift · ∂²|a|²/2; whether the banded part is positive definite."""
         work, tap = self.work, self.map
         self.corner = newton_matrix.assemble(
@@ -141,6 +141,7 @@ class PhaseModel:
             self._arguments,
             self.problem.effort_weight,
             self.factor,
+            curvature,
             shift,
             tap.first,
             tap.taps,

@@ -1,4 +1,4 @@
-"""The default backend: the optimum in closed form where no limit is active, else an interior point method made for the structure.
+"""The default backend: the optimum in closed form where no limit is active, else a structured interior point method.
 
 Cost and memory grow linearly with the number of grid points. Every array is allocated once for each problem structure.
 """
@@ -70,7 +70,7 @@ class StructuredSolver:
 
         Args:
             problem: What is asked.
-            guess: Where to start if limits are active: a motion of any duration on any grid, such as the rest of a plan.
+            guess: Where to start if limits are active: a motion of any duration on any grid, as the rest of a plan.
 
         Returns:
             The solution. Failures are statuses; a trajectory is given even then, if there is a finite one, and it
@@ -90,7 +90,9 @@ class StructuredSolver:
         objective = model.values(x, T, g)
         at_ends, name = model.violation_at_the_ends()
         shortest = float((np.abs(problem.end_position - problem.start_position) / problem.velocity_limit).max())
-        if not at_ends <= settings.violation_tolerance:
+        if not np.isfinite(at_ends):
+            return self._refused(problem, began, f"{name} is not finite at a boundary", Status.NONFINITE)
+        if at_ends > settings.violation_tolerance:
             return self._refused(problem, began, f"{name} is violated at a boundary by {at_ends:.1e} of its scale")
         if shortest > problem.max_duration * (1 + settings.violation_tolerance):
             return self._refused(problem, began, f"takes {shortest:.3f} s at top speed")
@@ -122,9 +124,10 @@ class StructuredSolver:
         timings["total"] = 1e3 * (time.perf_counter() - began)
         return Solution(_STATUS[outcome], trajectory, objective, iterations, violation, timings, message)
 
-    def _refused(self, problem: PhaseProblem, began: float, why: str) -> Solution:
+    @staticmethod
+    def _refused(problem: PhaseProblem, began: float, why: str, status: Status = Status.INFEASIBLE) -> Solution:
         timings = {"total": 1e3 * (time.perf_counter() - began)}
-        return Solution(Status.INFEASIBLE, None, np.nan, 0, np.inf, timings, f"{problem.name}: {why}")
+        return Solution(status, None, np.nan, 0, np.inf, timings, f"{problem.name}: {why}")
 
     def _stretched(self, problem: PhaseProblem, T: float) -> Trajectory:
         """The motion of least effort, slow enough to keep the speed limits at the grid points if it may be."""

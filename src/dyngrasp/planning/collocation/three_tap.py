@@ -1,7 +1,7 @@
 """The change of variables that removes the dynamics: one sequence r a joint, of which q, w and a are three-tap filters.
 
-With s = t/T, w = T q̇, a = T² q̈ and h = 1/N the trapezoidal rule, eq. (3b), is linear, constant and free of T. Its solutions
-are exactly those of a sequence r[−1 … N+1]:
+With s = t/T, w = T q̇, a = T² q̈ and h = 1/N the trapezoidal rule, eq. (3b), is linear, constant and free of T. Its
+solutions are exactly those of a sequence r[−1 … N+1]:
 
     q[k] = (r[k−1] + 2 r[k] + r[k+1]) / 4,
     w[k] = (r[k+1] − r[k−1]) / (2 h),
@@ -11,8 +11,8 @@ The boundary states at k = 0 fix the neighbours of r[0],
 
     r[±1] = 2 q_S − r[0] ± h T q̇_S,
 
-and likewise those of r[N]. What is left are the N − 1 unknowns x = (r[0], r[2], …, r[N−2], r[N]) a joint, and T, without any
-equality constraint. Every grid point depends on at most three consecutive unknowns, the ones near the ends also on T:
+and likewise those of r[N]. What is left are the N − 1 unknowns x = (r[0], r[2], …, r[N−2], r[N]) a joint, and T, without
+any equality constraint. Every grid point depends on at most three consecutive unknowns, the ones near the ends also on T:
 
     z[k] = Σ_b taps[k, b] x[first[k] + b] + offset[k] + T slope[k]      for z = q, w and a.
 """
@@ -101,7 +101,7 @@ def _filters(intervals: int) -> tuple[Array, Array, Array]:
 
 @njit(cache=True)
 def expand(first: Array, taps: Array, offset: Array, slope: Array, x: Array, duration: float, z: Array) -> None:
-    """z = offset + T slope + taps applied to x."""
+    """Write z = offset + T slope + taps applied to x."""
     kinds, points, n = z.shape
     for kind in range(kinds):
         for k in range(points):
@@ -130,7 +130,9 @@ def pull_back(first: Array, taps: Array, slope: Array, dual: Array, gradient: Ar
     """The transpose of `expand_step`: derivatives by q, w and a become derivatives by x.
 
     Args:
-        first, taps, slope: The map.
+        first: The map, and so are the next two.
+        taps: (N+1, 3, 3)
+        slope: (3, N+1, n)
         dual: (3, N+1, n) derivatives of a scalar by q, w and a.
         gradient: (N−1, n), overwritten by the derivatives by x.
 
