@@ -157,7 +157,7 @@ def test_pads_are_parallel_with_the_stated_gap(posture: str, gap: float) -> None
     # The postures are written with 8 decimals.
     apart = (finger_1.translation - finger_3.translation) @ closing - 2 * toml["pad_radius"]
     assert apart == pytest.approx(gap, abs=1e-8)
-    # The collision pads stop where the arcs do. MuJoCo's distance of ellipsoids is iterative: a micrometre.
+    # The collision pads stop where the arcs do. MuJoCo's distance of ellipsoids is iterative: 20 micrometres.
     between = np.zeros(6)
     ends = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in toml["pad_geoms"]]
     assert mujoco.mj_geomDistance(model, data, ends[0], ends[1], 1.0, between) == pytest.approx(gap, abs=2e-5)

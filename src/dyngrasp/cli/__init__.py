@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DELIVERED
 
 
-def _guarded(command, options: argparse.Namespace) -> int:  # noqa: ANN001
+def _guarded(command: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
     from dyngrasp.errors import DyngraspError
 
     try:
@@ -57,6 +57,6 @@ def _guarded(command, options: argparse.Namespace) -> int:  # noqa: ANN001
 
 
 def _quiet_threads() -> None:
-    """One thread of linear algebra a process: matrices of seven joints gain nothing from more, and studies fill the cores."""
+    """One thread of linear algebra a process: matrices of seven joints gain nothing from more."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

@@ -59,7 +59,7 @@ def draw_trial(workcell: Workcell, seed: int) -> Trial:
 
 
 def _believed(T_world_object: pin.SE3, part: GraspObject, pose: PoseSection, rng: np.random.Generator) -> pin.SE3:
-    """The true pose, displaced in the grasp frame: an error there is what the fingers feel, wherever the origin lies."""
+    """The true pose, displaced in the grasp frame: what the fingers feel, wherever the part's origin lies."""
     # All draws are made whatever the settings: those of one setting must not shift the others'.
     signs = rng.choice([-1.0, 1.0], 3)
     offset = 1e-3 * np.array([pose.along_mm, pose.across_mm, pose.up_mm]) * (signs if pose.random_sign else 1.0)

@@ -59,7 +59,9 @@ class OutputFolder:
     def __enter__(self) -> OutputFolder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if kind is not None:
             self._remove_empty()
 
@@ -106,7 +108,7 @@ def atomic(path: str | Path) -> Iterator[Path]:
 
 
 def write_json(path: str | Path, document: Any) -> None:
-    """Write a document as strict JSON; a number that is not finite becomes `null`, for JSON has no other word for it."""
+    """Write a document as strict JSON; a number that is not finite becomes `null`: JSON has no word for it."""
     with atomic(path) as temporary:
         text = json.dumps(_strict(document), indent=1, allow_nan=False, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")

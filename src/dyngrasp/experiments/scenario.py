@@ -6,9 +6,9 @@ import dataclasses
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, create_model
+from pydantic import AfterValidator, BeforeValidator, Field, create_model, model_validator
 
 from dyngrasp.errors import ModelFileError, ScenarioError
 from dyngrasp.models.model_file import Finite, NonNegative, StrictSchema, decode, read_toml
@@ -89,7 +89,7 @@ _TaskSettingsSection = settings_schema(TaskSettings)
 
 
 class TaskSection(StrictSchema):
-    """`[task]`: arm, gripper and part, by name in the catalogue or path of a model file, and where the motion begins and ends.
+    """`[task]`: arm, gripper and part, by name or by path of a model file, and where the motion begins and ends.
 
     `start_deg` and `place_deg` hold one angle a joint. `settings` overrides fields of `TaskSettings`, in SI units.
     """
@@ -143,6 +143,14 @@ class PoseSection(StrictSchema):
     across_mm: Finite = 0.0
     up_mm: Finite = 0.0
     random_sign: bool = True
+
+    @model_validator(mode="after")
+    def _truth_is_exact(self) -> Self:
+        if self.source == "truth" and any(
+            (self.position_mm, self.rotation_deg, self.along_mm, self.across_mm, self.up_mm)
+        ):
+            raise ValueError('no errors with source = "truth"; set source = "noise"')
+        return self
 
 
 class PlantSection(StrictSchema):

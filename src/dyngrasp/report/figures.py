@@ -180,8 +180,8 @@ def error_curve_figure(
         ax.set_ylabel("delivered by every criterion")
         trials = sorted({outcome.trials for curve in curves for outcome in curve.outcomes})
         count = f"{trials[0]}" if len(trials) == 1 else f"{trials[0]} to {trials[-1]}"
-        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), title=f"{count} trials a point\n95 % intervals (Wilson)",
-                  alignment="left", title_fontsize=8)  # fmt: skip
+        ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), alignment="left",
+                  title=f"{count} trials a point\n95 % intervals (Wilson)", title_fontsize=8)  # fmt: skip
         if title:
             ax.set_title(title, loc="left", fontweight="bold", color=INK)
     return figure

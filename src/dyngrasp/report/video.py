@@ -17,7 +17,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], frames_pe
 
     Args:
         path: Where the file goes; it appears only when it is complete.
-        frames: Images (height, width, 3) of one size, with even height and width (H.264 stores colour at half resolution).
+        frames: Images (height, width, 3) of one size, its sides even: H.264 stores colour at half resolution.
         frames_per_second: Playback rate.
 
     Returns:
