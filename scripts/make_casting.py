@@ -314,7 +314,8 @@ def solve_wall() -> float:
     return round(float(wall), 2)
 
 
-# Fiducials on the machined pads: number, centre in the drawing frame (mm), columns of the rotation (x, y, z out of the face).
+# Fiducials on the machined pads: number, centre in the drawing frame (mm), columns of the rotation (x, y, and z out of
+# the face).
 UP = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 TO_PLUS_X = ((0, 1, 0), (0, 0, 1), (1, 0, 0))
 TO_MINUS_X = ((0, -1, 0), (0, 0, 1), (-1, 0, 0))
@@ -352,7 +353,8 @@ mesh = "casting.stl"
 pieces = [
 {names},
 ]
-# Uniform density of {DENSITY:g} kg/m3 (aluminium casting alloy, an assumption), walls of {wall:g} mm (solved for this mass).
+# Uniform density of {DENSITY:g} kg/m3 (aluminium casting alloy, an assumption), walls of {wall:g} mm (solved for the
+# mass).
 mass = {mesh.mass:.6f}
 centre_of_mass = [{com[0]:.6f}, {com[1]:.6f}, {com[2]:.6f}]
 # World z of the object origin when the part stands on the ground: the paper draws its object positions at 0.1 m.
@@ -380,7 +382,7 @@ position = [0.0, 0.0, {grasp_z:g}]
 quat_wxyz = [0.0, 0.0, 0.0, 1.0]
 width = {2e-3 * RIB_HALF_THICKNESS:g}
 
-# The inverted Gaussian of the approach. The paper gives 5 mm and 2 mm (read as standard deviations) but not z_threshold.
+# The inverted Gaussian of the approach. The paper gives 5 mm and 2 mm (read as standard deviations), not z_threshold.
 [funnel]
 z_threshold = 0.10
 sigma_x = 0.005

@@ -1,21 +1,24 @@
 """Whether a plan may be executed: every constraint evaluated anew, on a finer grid, by other means than the solver's.
 
-The torques come from Pinocchio's full inverse dynamics with its velocity terms (the planner uses symbolic M v + g and
-bounds), the funnel from the paper's formula as it stands, clearances from the collision geometry.
+The torques come from recursive Newton-Euler with its velocity terms (the planner uses symbolic M v + g and bounds), the
+funnel from the paper's formula as it stands, clearances from the collision geometry. All samples of a plan go through
+compiled loops at once: the audit is part of every cycle of replanning.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.models.robot import RobotModel
+from dyngrasp.models.assembly import Assembly, assemble
+from dyngrasp.models.batch_dynamics import Attachments, BatchModel, wrench_on
+from dyngrasp.models.kinematic_tree import frames_named
 from dyngrasp.planning.clearance import clearance_entries
-from dyngrasp.planning.grasp_targets import GRAVITY, GraspTargets, GraspTask
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry, AuditReport
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, Trajectory
@@ -36,9 +39,12 @@ CHORD_TOLERANCE = 5e-5
 
 @dataclass(frozen=True)
 class _Samples:
-    """One phase on the fine grid: times on the plan's clock (M,), arm (M, n) and gripper (M, m) states."""
+    """A plan on the fine grid, phase after phase: times on its clock (M,), arm (M, n) and gripper (M, m) states.
 
-    phase: str
+    `phases` are the three slices of M.
+    """
+
+    phases: tuple[slice, slice, slice]
     times: Array
     q: Array
     w: Array
@@ -46,6 +52,36 @@ class _Samples:
     q_h: Array
     w_h: Array
     v_h: Array
+
+
+class _Models:
+    """What does not change from plan to plan: arrays of the arm empty and loaded, frames of flange and pads."""
+
+    def __init__(self, task: GraspTask, grasp_name: str) -> None:
+        grasp = next(grasp for grasp in task.grasp_object.grasps if grasp.name == grasp_name)
+        self.empty = BatchModel.from_pinocchio(task.robot_empty.loaded_model)
+        self.loaded = BatchModel.from_pinocchio(task.robot_loaded(grasp).loaded_model)
+        self.assembly: Assembly = assemble(task.robot, task.gripper)
+        self.tree = BatchModel.from_pinocchio(self.assembly.pin_model)
+        pads = (frames_named(self.assembly.pin_model, name)[0] for name in task.gripper.pads)
+        ids = [self.assembly.flange_id, *pads]
+        frames = [self.assembly.pin_model.frames[i] for i in ids]
+        placed = [(int(frame.parentJoint), pin.SE3(frame.placement)) for frame in frames]
+        # The axes of the pinch are those of the hand; only its origin depends on the fingers.
+        hand = placed[0][1] * task.gripper.T_flange_hand * task.gripper.T_hand_grasp(task.gripper.open_posture)
+        self.hand_frames: Attachments = self.tree.attach([(placed[0][0], hand), *placed[1:]])
+
+    def hand(self, q: Array, q_h: Array) -> tuple[Array, Array]:
+        """The grasp frame as the hand holds it, in the world: rotations (M, 3, 3), positions of G (M, 3)."""
+        both = np.empty((len(q), self.tree.parents.size))
+        both[:, self.assembly.arm_indices], both[:, self.assembly.hand_indices] = q, q_h
+        R, p = self.tree.poses(both, self.hand_frames)
+        return R[:, 0], (p[:, 1] + p[:, 2]) / 2
+
+
+@lru_cache(maxsize=8)
+def _models(task: GraspTask, grasp_name: str) -> _Models:
+    return _Models(task, grasp_name)
 
 
 def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditReport:
@@ -60,48 +96,71 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditRepor
         One entry a constraint, each with the worst value, its bound and its time. A plan that fails one must not be
         executed.
     """
-    phases = [_sample(plan, i) for i in range(len(PHASE_NAMES))]
-    robots = (task.robot_empty, task.robot_empty, task.robot_loaded(targets.grasp))
-    approach, grasp, deliver = phases
+    models = _models(task, targets.grasp.name)
+    samples = _sample(plan)
+    approach, grasp, deliver = samples.phases
+    torques, _ = models.empty.inverse_dynamics(*(x[: grasp.stop] for x in (samples.q, samples.w, samples.v)))
+    loaded, motion = models.loaded.inverse_dynamics(*(x[deliver] for x in (samples.q, samples.w, samples.v)))
+    R, G = models.hand(samples.q[: grasp.stop], samples.q_h[: grasp.stop])
+    G, angles = _seen_from_grasp(R, G, samples.times[: grasp.stop], targets)
     entries = [
         _dynamics(plan),
         *_joins(plan),
-        *_boundaries(plan, targets, task),
-        *_box_entries("", phases, task.robot, plan.arm_joints),
-        *_gripper_entries(phases, task),
-        _torque(phases, robots, plan.arm_joints),
-        _funnel(approach, targets, task),
-        *_reversal(grasp, targets, task),
-        _hold(deliver, targets, task),
+        *_boundaries(plan, targets, task, models),
+        *_box_entries(samples, plan, task),
+        _at_most(
+            "torque",
+            np.abs(np.concatenate([torques, loaded])) / task.robot.limits.torque,
+            samples.times,
+            1.0,
+            RATIO_TOLERANCE,
+            "of limit",
+            plan.arm_joints,
+        ),
+        _funnel(G[approach], samples.times[approach], task),
+        *_reversal(G[grasp], angles[grasp], samples.times[grasp], task),
+        _hold(motion, samples.times[deliver], targets, task, models),
         *clearance_entries(
             task,
             targets,
-            {phase.phase: (phase.times, phase.q, phase.q_h) for phase in phases},
+            {
+                name: (samples.times[part], samples.q[part], samples.q_h[part])
+                for name, part in zip(PHASE_NAMES, samples.phases, strict=True)
+            },
         ),
     ]
     return AuditReport(tuple(entries))
 
 
-def _sample(plan: GraspPlan, i: int) -> _Samples:
-    arm, gripper = plan.arm[i], plan.gripper[i]
-    local = np.linspace(0.0, arm.duration, SUBSTEPS * max(arm.intervals, gripper.intervals) + 1)
-    start = plan.phase_ends[i] - arm.duration
-    return _Samples(PHASE_NAMES[i], start + local, *arm.sample_many(local), *gripper.sample_many(local))
+def _sample(plan: GraspPlan) -> _Samples:
+    tables, phases, end = [], [], 0
+    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends, strict=True):
+        local = np.linspace(0.0, arm.duration, SUBSTEPS * max(arm.intervals, gripper.intervals) + 1)
+        tables.append((T - arm.duration + local, *arm.sample_many(local), *gripper.sample_many(local)))
+        phases.append(slice(end, end + local.size))
+        end += local.size
+    return _Samples(tuple(phases), *(np.concatenate(column) for column in zip(*tables, strict=True)))
 
 
 def _at_most(
-    name: str, values: Array, times: Array, bound: float, tolerance: float, unit: str, names=None
+    name: str,
+    values: Array,
+    times: Array,
+    bound: float,
+    tolerance: float,
+    unit: str,
+    names: tuple[str, ...] | None = None,
 ) -> AuditEntry:
     """Entry for values (M,) or (M, k) that must not exceed `bound`; `names` are those of the k columns."""
-    table = values[:, None] if values.ndim == 1 else values
-    # A NaN is the worst value there can be, and must not hide behind a comparison that it fails silently.
-    row, column = np.unravel_index(np.argmax(np.where(np.isnan(table), np.inf, table)), table.shape)
+    # numpy's argmax and argmin stop at a NaN: it is the worst value there can be.
+    table = values.reshape(times.size, -1)
+    row, column = np.unravel_index(int(np.argmax(table)), table.shape)
     detail = names[column] if names else ""
     return AuditEntry(name, float(table[row, column]), bound, False, tolerance, unit, float(times[row]), detail)
 
 
 def _at_least(name: str, values: Array, times: Array, bound: float, tolerance: float, unit: str) -> AuditEntry:
-    row = int(np.argmin(np.where(np.isnan(values), -np.inf, values)))
+    row = int(np.argmin(values))
     return AuditEntry(name, float(values[row]), bound, True, tolerance, unit, float(times[row]))
 
 
@@ -130,149 +189,104 @@ def _neighbours(phases: tuple[Trajectory, ...]) -> list[tuple[Trajectory, Trajec
     return list(itertools.pairwise(phases))
 
 
-def _boundaries(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> list[AuditEntry]:
+def _boundaries(plan: GraspPlan, targets: GraspTargets, task: GraspTask, models: _Models) -> list[AuditEntry]:
     """Where the hand really is at T_1, T_2, T_3, from the plan's joints alone, against where it was sent."""
-    settings = task.settings
-    above = pin.SE3(np.eye(3), np.array([0.0, 0.0, settings.pregrasp_distance]))
-    place = task.robot.forward_kinematics(targets.place.position)
-    wanted = (
-        targets.T_world_grasp * above,
-        targets.T_world_grasp,
-        place * _grasp_in_flange(task, targets.gripper_closed),
+    ends = [phase.position[-1] for phase in plan.arm]
+    fingers = [phase.position[-1] for phase in plan.gripper]
+    R, G = models.hand(np.array([*ends, targets.place.position]), np.array([*fingers, targets.gripper_closed]))
+    inside, angles = _seen_from_grasp(R[:2], G[:2], plan.phase_ends[:2], targets)
+    above = np.array([0.0, 0.0, task.settings.pregrasp_distance])
+    errors = (
+        ("pregrasp", inside[0] - above, angles[0]),
+        ("grasp", inside[1], angles[1]),
+        ("place", G[2] - G[3], _angles(R[2], R[3])),
     )
     entries = []
-    for name, i, T_wanted in zip(("pregrasp", "grasp", "place"), range(3), wanted, strict=True):
-        T_flange = task.robot.forward_kinematics(plan.arm[i].position[-1])
-        error = pin.log6(T_wanted.actInv(T_flange * _grasp_in_flange(task, plan.gripper[i].position[-1])))
-        time = float(plan.phase_ends[i])
-        distance, angle = float(np.linalg.norm(error.linear)), float(np.linalg.norm(error.angular))
+    for time, (name, offset, angle) in zip(plan.phase_ends.tolist(), errors, strict=True):
+        distance = float(np.linalg.norm(offset))
         entries.append(AuditEntry(f"{name}_position", distance, 0.0, False, LENGTH_TOLERANCE, "m", time))
-        entries.append(AuditEntry(f"{name}_angle", angle, 0.0, False, 1e-5, "rad", time))
-    lift = _tip_velocity(task, plan.arm[1].position[-1], plan.arm[1].velocity[-1], plan.gripper[1].position[-1])[2]
-    entries.append(
-        AuditEntry("lift_velocity", float(lift), 0.0, True, LENGTH_TOLERANCE, "m/s", float(plan.phase_ends[1]))
-    )
+        entries.append(AuditEntry(f"{name}_angle", float(angle), 0.0, False, 1e-5, "rad", time))
+    q, w = plan.arm[1].position[-1], plan.arm[1].velocity[-1]
+    twist = task.robot.jacobian(q) @ w
+    lever = G[1] - task.robot.forward_kinematics(q).translation
+    lift = float(twist[2] + twist[3] * lever[1] - twist[4] * lever[0])
+    time = float(plan.phase_ends[1])
+    entries.append(AuditEntry("lift_velocity", lift, 0.0, True, LENGTH_TOLERANCE, "m/s", time))
     rest = float(np.abs(plan.arm[2].velocity[-1]).max())
     entries.append(AuditEntry("rest_at_place", rest, 0.0, False, JOIN_TOLERANCE, "rad/s", plan.end_time))
     return entries
 
 
-def _grasp_in_flange(task: GraspTask, q_h: Array) -> pin.SE3:
-    return task.gripper.T_flange_hand * task.gripper.T_hand_grasp(q_h)
+def _seen_from_grasp(R: Array, G: Array, times: Array, targets: GraspTargets) -> tuple[Array, Array]:
+    """G (M, 3) in the grasp frame where the part is at each time, and the angle of the hand against it (M,)."""
+    R_part, p_part = targets.part_poses(times)
+    R_grasp = R_part @ targets.grasp.T_object_grasp.rotation
+    origin = p_part + R_part @ targets.grasp.T_object_grasp.translation
+    return ((G - origin)[:, None] @ R_grasp)[:, 0], _angles(R, R_grasp)
 
 
-def _tip_velocity(task: GraspTask, q: Array, w: Array, q_h: Array) -> Array:
-    """(3,) world velocity of the point of the hand where G is (m/s), the gripper taken as still."""
-    T_flange = task.robot.forward_kinematics(q)
-    lever = T_flange.rotation @ _grasp_in_flange(task, q_h).translation
-    twist = task.robot.jacobian(q) @ w
-    return twist[:3] + np.cross(twist[3:], lever)
+def _angles(R: Array, other: Array) -> Array:
+    """Angle (...) between rotations (..., 3, 3); from their difference, which is exact near zero."""
+    chord = np.sqrt(((R - other) ** 2).sum(axis=(-2, -1)) / 8)
+    return 2 * np.arcsin(np.minimum(chord, 1.0))
 
 
-def _box_entries(prefix: str, phases: list[_Samples], robot: RobotModel, names: tuple[str, ...]) -> list[AuditEntry]:
-    limits = robot.limits
-    middle, half = (
-        (limits.position_upper + limits.position_lower) / 2,
-        (limits.position_upper - limits.position_lower) / 2,
+def _box_entries(samples: _Samples, plan: GraspPlan, task: GraspTask) -> list[AuditEntry]:
+    """Positions, velocities and accelerations of arm and gripper as parts of their limits."""
+    limits, gripper = task.robot.limits, task.gripper
+    table = (
+        ("position", _off_centre(samples.q, limits.position_lower, limits.position_upper), plan.arm_joints),
+        ("velocity", np.abs(samples.w) / limits.velocity, plan.arm_joints),
+        ("acceleration", np.abs(samples.v) / limits.acceleration, plan.arm_joints),
+        ("gripper_position", _off_centre(samples.q_h, gripper.lower, gripper.upper), plan.gripper_joints),
+        ("gripper_velocity", np.abs(samples.w_h) / gripper.velocity, plan.gripper_joints),
+        ("gripper_acceleration", np.abs(samples.v_h) / gripper.acceleration, plan.gripper_joints),
     )
-    times = np.concatenate([p.times for p in phases])
-    ratios: dict[str, Callable[[_Samples], Array]] = {
-        "position": lambda p: np.abs(p.q - middle) / half,
-        "velocity": lambda p: np.abs(p.w) / limits.velocity,
-        "acceleration": lambda p: np.abs(p.v) / limits.acceleration,
-    }
     return [
-        _at_most(
-            prefix + name, np.concatenate([ratio(p) for p in phases]), times, 1.0, RATIO_TOLERANCE, "of limit", names
-        )
-        for name, ratio in ratios.items()
+        _at_most(name, values, samples.times, 1.0, RATIO_TOLERANCE, "of limit", names) for name, values, names in table
     ]
 
 
-def _gripper_entries(phases: list[_Samples], task: GraspTask) -> list[AuditEntry]:
-    gripper = task.gripper
-    middle, half = (gripper.upper + gripper.lower) / 2, (gripper.upper - gripper.lower) / 2
-    times = np.concatenate([p.times for p in phases])
-    table = {
-        "gripper_position": np.concatenate([np.abs(p.q_h - middle) / half for p in phases]),
-        "gripper_velocity": np.concatenate([np.abs(p.w_h) / gripper.velocity for p in phases]),
-        "gripper_acceleration": np.concatenate([np.abs(p.v_h) / gripper.acceleration for p in phases]),
-    }
-    names = gripper.joint_names
-    return [_at_most(name, v, times, 1.0, RATIO_TOLERANCE, "of limit", names) for name, v in table.items()]
+def _off_centre(q: Array, lower: Array, upper: Array) -> Array:
+    """Distance from the middle of the range over its half-width."""
+    return np.abs(q - (upper + lower) / 2) / ((upper - lower) / 2)
 
 
-def _torque(phases: list[_Samples], robots: tuple[RobotModel, ...], names: tuple[str, ...]) -> AuditEntry:
-    """Full inverse dynamics, velocity terms included, against the whole torque limit; the part counts in phase 3."""
-    ratios = np.concatenate(
-        [
-            [
-                np.abs(robot.inverse_dynamics(q, w, v)) / robot.limits.torque
-                for q, w, v in zip(p.q, p.w, p.v, strict=True)
-            ]
-            for p, robot in zip(phases, robots, strict=True)
-        ]
-    )
-    times = np.concatenate([p.times for p in phases])
-    return _at_most("torque", ratios, times, 1.0, RATIO_TOLERANCE, "of limit", names)
-
-
-def _grasp_point(task: GraspTask, p: _Samples) -> tuple[Array, Array]:
-    """World position of G (M, 3) and the grasp frame's rotation as the hand holds it (M, 3, 3)."""
-    positions, rotations = [], []
-    for q, q_h in zip(p.q, p.q_h, strict=True):
-        T = task.robot.forward_kinematics(q) * _grasp_in_flange(task, q_h)
-        positions.append(T.translation.copy())
-        rotations.append(T.rotation.copy())
-    return np.array(positions), np.array(rotations)
-
-
-def _funnel(approach: _Samples, targets: GraspTargets, task: GraspTask) -> AuditEntry:
-    """h(q) of eq. (7): the height of G in the grasp frame above the inverted Gaussian of eq. (6)."""
-    funnel, T = task.grasp_object.funnel, targets.T_world_grasp
-    G, _ = _grasp_point(task, approach)
-    x, y, z = ((G - T.translation) @ T.rotation).T
+def _funnel(G: Array, times: Array, task: GraspTask) -> AuditEntry:
+    """h(q) of eq. (7): the height of G (M, 3) in the grasp frame above the inverted Gaussian of eq. (6)."""
+    funnel = task.grasp_object.funnel
+    x, y, z = G.T
     bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
-    return _at_least("funnel", z - funnel.z_threshold * (1.0 - bell), approach.times, 0.0, CHORD_TOLERANCE, "m")
+    return _at_least("funnel", z - funnel.z_threshold * (1.0 - bell), times, 0.0, CHORD_TOLERANCE, "m")
 
 
-def _reversal(grasp: _Samples, targets: GraspTargets, task: GraspTask) -> list[AuditEntry]:
-    """G stays on the grasp axis, does not pass far below the grasp frame, and the hand does not tilt as it closes."""
-    settings, T = task.settings, targets.T_world_grasp
-    G, rotations = _grasp_point(task, grasp)
-    x, y, z = ((G - T.translation) @ T.rotation).T
-    tilt = np.arccos(np.clip(rotations[:, :, 2] @ T.rotation[:, 2], -1.0, 1.0))
-    lateral = np.hypot(x, y)
+def _reversal(G: Array, angles: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
+    """G stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes."""
+    settings = task.settings
+    lateral = np.hypot(G[:, 0], G[:, 1])
     return [
-        _at_most("grasp_axis", lateral, grasp.times, settings.lateral_tolerance, CHORD_TOLERANCE, "m"),
-        _at_least("grasp_dip", z, grasp.times, -settings.dip_tolerance, CHORD_TOLERANCE, "m"),
-        _at_most("grasp_tilt", tilt, grasp.times, settings.tilt_tolerance, 1e-4, "rad"),
+        _at_most("grasp_axis", lateral, times, settings.lateral_tolerance, CHORD_TOLERANCE, "m"),
+        _at_least("grasp_dip", G[:, 2], times, -settings.dip_tolerance, CHORD_TOLERANCE, "m"),
+        _at_most("grasp_tilt", angles, times, settings.tilt_tolerance, 1e-4, "rad"),
     ]
 
 
-def _hold(deliver: _Samples, targets: GraspTargets, task: GraspTask) -> AuditEntry:
+def _hold(motion: Array, times: Array, targets: GraspTargets, task: GraspTask, models: _Models) -> AuditEntry:
     """Share of the pinch's friction limit surface that the part asks for as it is carried, velocity terms included.
 
     Two pads pressed with N hold a tangential force 2 μ N and a moment 2 t N about the closing axis; the limit surface
     is taken as an ellipse. The safety factor is not applied here: at 1 the part would just slip.
     """
-    part, gripper, robot = task.grasp_object, task.gripper, task.robot
-    model, data = robot.pin_model, robot.pin_model.createData()
-    frame = model.getFrameId(robot.tip_frame)
-    in_flange = _grasp_in_flange(task, targets.gripper_closed)
-    part_in_grasp = targets.grasp.T_object_grasp.inverse().act(part.spatial_inertia)
-    gravity = pin.Motion(np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
-    shares = []
-    for q, w, v in zip(deliver.q, deliver.w, deliver.v, strict=True):
-        pin.forwardKinematics(model, data, q, w, v)
-        pin.updateFramePlacement(model, data, frame)
-        velocity = in_flange.actInv(pin.getFrameVelocity(model, data, frame, pin.LOCAL))
-        acceleration = in_flange.actInv(pin.getFrameAcceleration(model, data, frame, pin.LOCAL))
-        upward = pin.Motion((data.oMf[frame] * in_flange).rotation.T @ gravity.linear, np.zeros(3))
-        wrench = part_in_grasp * (acceleration + upward) + velocity.cross(part_in_grasp * velocity)
-        tangential = float(np.hypot(wrench.linear[0], wrench.linear[2])) / (
-            2 * part.friction.sliding * gripper.pinch_force
-        )
-        torsion = float(wrench.angular[1]) / (2 * part.friction.torsional * gripper.pinch_force)
-        shares.append(np.hypot(tangential, torsion))
-    return _at_most("hold", np.array(shares), deliver.times, 1.0, RATIO_TOLERANCE, "of the grip")
+    part, robot = task.grasp_object, task.robot
+    in_flange = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_closed)
+    frame = models.loaded.attach([(robot.n, robot.T_last_flange * in_flange)])
+    T_link_grasp = pin.SE3(frame.rotations[0], frame.positions[0])
+    body = (T_link_grasp * targets.grasp.T_object_grasp.inverse()).act(part.spatial_inertia)
+    wrench = wrench_on(body, motion)
+    closing = T_link_grasp.rotation[:, 1]
+    force, along = wrench[:, :3], wrench[:, :3] @ closing
+    tangential = np.sqrt(np.maximum((force**2).sum(axis=1) - along**2, 0.0))
+    torsion = wrench[:, 3:] @ closing - force @ np.cross(closing, T_link_grasp.translation)
+    per_finger = 2 * task.gripper.pinch_force * np.array([part.friction.sliding, part.friction.torsional])
+    share = np.hypot(tangential / per_finger[0], torsion / per_finger[1])
+    return _at_most("hold", share, times, 1.0, RATIO_TOLERANCE, "of the grip")

@@ -1,24 +1,45 @@
-"""Distances between the moving bodies, the part and the ground along a plan, from their collision geometry (Coal)."""
+"""Distances between the moving bodies, the part and the ground along a plan, from their collision geometry (Coal).
+
+The least distance over all pairs of bodies and all samples is found without measuring most of them: compiled lower
+bounds (`models.distance_bounds`) say which pair at which sample could be nearest, that one is measured exactly, and
+what it shows bounds the samples around it; it ends when no bound is below the least distance measured.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import coal
 import numpy as np
 import pinocchio as pin
 import trimesh
+from numba import njit
+from numpy.typing import NDArray
 
 from dyngrasp.models.assembly import Assembly, assemble
+from dyngrasp.models.batch_dynamics import BatchModel
+from dyngrasp.models.distance_bounds import (
+    Capsules,
+    Tracks,
+    bounding_capsule,
+    box_heights,
+    heights,
+    near_boxes,
+    near_capsules,
+    tighten,
+    tracks,
+)
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry
-from dyngrasp.signals import Array
+from dyngrasp.signals import Array, read_only
 
-# Pairs whose bounding spheres are farther apart than this (m) are not measured: the audit asks for contact, not for
-# the exact width of a gap that nobody would call narrow.
+Indices = NDArray[np.intp]
+
+# Distances above this (m) are not measured: the audit asks for contact, not for the exact width of a gap that nobody
+# would call narrow.
 HORIZON = 0.10
 
 # The hand moves at most this far (rad of any joint) between two samples: about a centimetre at the finger tips.
@@ -27,20 +48,33 @@ JOINT_STEP = 0.015
 # The part stands on the ground when it is lifted; its own pieces may reach this far below z = 0 by rounding (m).
 RESTING_TOLERANCE = 5e-4
 
-GROUND = "ground"
+# Coal's iterations stop within this of the distance (m); bounds that are nearer to each other say nothing.
+RESOLUTION = 1e-6
+
+# Joints between two bodies below which they cannot meet, or always touch.
+APART = 3
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """Two bodies to keep apart, by index into the geometry model."""
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Pairs that may come near: geometry and frame of both, lower bounds and combined path along the samples.
 
-    first: int
-    second: int
-    name: str
+    Attributes:
+        first, second: (K,) bodies by index into `CellGeometry.names`.
+        bounds: (K, S) lower bounds of the distance (m), inf where a sample does not count.
+        travel: (K, S) path by which both have approached each other since the first sample, at most (m).
+    """
+
+    first: Indices
+    second: Indices
+    bounds: Array
+    travel: Array
 
 
 class CellGeometry:
     """Arm, gripper, part and ground as collision bodies; the part stands in the world or hangs in the gripper.
+
+    Bodies are numbered: those of arm and hand (`moving` of them move), the pieces of the part, the ground.
 
     Args:
         task: Arm, gripper and part.
@@ -49,101 +83,123 @@ class CellGeometry:
 
     def __init__(self, task: GraspTask, grasp: Grasp) -> None:
         self.assembly: Assembly = assemble(task.robot, task.gripper)
-        self.model = self.assembly.pin_model
-        self.data = self.model.createData()
-        self.geometry = pin.GeometryModel(self.assembly.geometry)
-        self.moving = [self.geometry.getGeometryId(n) for n in self.assembly.arm_geoms + self.assembly.hand_geoms]
-        self.pads = {self.geometry.getGeometryId(name) for name in self.assembly.pad_geoms}
-        self.hand = {self.geometry.getGeometryId(name) for name in self.assembly.hand_geoms}
-        self.pieces = [self._add_piece(path) for path in task.grasp_object.piece_paths]
-        self.ground = self.geometry.addGeometryObject(
-            pin.GeometryObject(GROUND, 0, pin.SE3.Identity(), coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
+        model, bodies = self.assembly.pin_model, list(self.assembly.geometry.geometryObjects)
+        # The model of the whole lives as long as its bodies, which refer to it.
+        self._geometry = self.assembly.geometry
+        self.tree = BatchModel.from_pinocchio(model)
+        # Last of the frames is the flange: its motion is the carried part's.
+        flange = model.frames[self.assembly.flange_id]
+        self.frames = self.tree.attach(
+            [(joint, pin.SE3.Identity()) for joint in range(model.njoints)]
+            + [(int(flange.parentJoint), pin.SE3(flange.placement))]
         )
-        self.placements = pin.GeometryData(self.geometry)
+        pieces = [_convex(path) for path in task.grasp_object.piece_paths]
+        self.ground = len(bodies) + len(pieces)
+        self.names = [body.name for body in bodies] + [path.stem for path in task.grasp_object.piece_paths] + ["ground"]
+        self.shapes = [body.geometry for body in bodies]
+        self.shapes += [shape for shape, _ in pieces] + [coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)]
+        self.links = np.array([int(body.parentJoint) for body in bodies], dtype=np.int64)
+        self.placements = [coal.Transform3s(body.placement.rotation, body.placement.translation) for body in bodies]
+        self.capsules = self._capsules(bodies)
+        self.low = read_only([points.min(axis=0) for _, points in pieces])
+        self.high = read_only([points.max(axis=0) for _, points in pieces])
+        self._group(task)
         T_flange_grasp = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(task.closed_posture(grasp))
         self.T_flange_object = T_flange_grasp * grasp.T_object_grasp.inverse()
-        self.spheres = [self._bounding_sphere(body) for body in self.geometry.geometryObjects]
-        self._centres = np.zeros((len(self.spheres), 3))
         self.request, self.result = coal.DistanceRequest(), coal.DistanceResult()
 
-    def _add_piece(self, path) -> int:
-        hull = trimesh.load_mesh(path).convex_hull
-        points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-        for vertex in hull.vertices:
-            points.append(np.asarray(vertex))
-        for face in hull.faces:
-            faces.append(coal.Triangle(*(int(i) for i in face)))
-        piece = pin.GeometryObject(path.stem, 0, pin.SE3.Identity(), coal.Convex(points, faces))
-        return self.geometry.addGeometryObject(piece)
+    def _capsules(self, bodies: list[pin.GeometryObject]) -> Capsules:
+        ends, radii = [], []
+        for body in bodies:
+            segment, radius = bounding_capsule(body.geometry)
+            ends.append([body.placement.act(end) for end in segment])
+            radii.append(radius)
+        return Capsules(self.links, read_only(ends), read_only(radii))
 
-    @staticmethod
-    def _bounding_sphere(body: pin.GeometryObject) -> tuple[Array, float]:
-        """Centre in the body's own frame (m) and radius (m) of a sphere around it."""
-        if isinstance(body.geometry, coal.Halfspace):
-            return np.zeros(3), np.inf
-        body.geometry.computeLocalAABB()
-        return np.array(body.geometry.aabb_center), float(body.geometry.aabb_radius)
+    def _group(self, task: GraspTask) -> None:
+        """Which bodies belong together, as indices."""
+        hand, pads = set(self.assembly.hand_geoms), set(self.assembly.pad_geoms)
+        on_hand = np.array([name in hand for name in self.names[: len(self.links)]])
+        self.is_pad = np.array([name in pads for name in self.names[: len(self.links)]])
+        moving = (self.links > 0) | on_hand
+        self.moving = np.flatnonzero(moving)
+        self.arm_and_base = np.flatnonzero(~on_hand)
+        # The hand counts as the last link; what is fewer joints apart touches by construction or cannot meet.
+        link = np.where(on_hand, task.robot.n, np.minimum(self.links, task.robot.n))
+        first, second = np.nonzero(link[None, :] - link[:, None] >= APART)
+        self.self_pairs = first.astype(np.int64), second.astype(np.int64)
 
-    def place(self, q: Array, q_h: Array, T_world_object: pin.SE3) -> None:
-        """Move arm and hand to one configuration and the part to a pose."""
-        configuration = self.assembly.configuration(q, q_h)
-        pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.placements, configuration)
-        self.place_part(T_world_object)
+    def poses(self, q: Array, q_h: Array) -> tuple[Array, Array]:
+        """Poses of all links (world first) and the flange (last): (S, L, 3, 3), (S, L, 3)."""
+        both = np.empty((len(q), self.tree.parents.size))
+        both[:, self.assembly.arm_indices], both[:, self.assembly.hand_indices] = q, q_h
+        return self.tree.poses(both, self.frames)
 
-    def place_part(self, T_world_object: pin.SE3) -> None:
-        """Move the part alone."""
-        for piece in self.pieces:
-            self.placements.oMg[piece] = T_world_object
-        self._centres = np.array([self.placements.oMg[i].act(c) for i, (c, _) in enumerate(self.spheres)])
+    def nearest(self, pairs: Candidates, scene: Scene) -> tuple[float, int, str]:
+        """Least distance (m, negative for penetration) among `pairs`, its sample and whose it is.
 
-    def nearest(self, pairs: Iterable[_Pair]) -> tuple[float, str]:
-        """Smallest distance (m, negative for penetration) among `pairs` and whose it is; at most `HORIZON`."""
-        best, name = HORIZON, ""
-        for pair in pairs:
-            if pair.second == self.ground:
-                apart = self._centres[pair.first][2] - self.spheres[pair.first][1]
-            else:
-                apart = np.linalg.norm(self._centres[pair.first] - self._centres[pair.second])
-                apart -= self.spheres[pair.first][1] + self.spheres[pair.second][1]
-            if apart >= best:
-                continue
-            distance = self._distance(pair)
-            if distance < best:
-                best, name = distance, pair.name
-        return best, name
+        `HORIZON`, the first sample and nobody if nothing comes nearer than that.
+        """
+        best, sample, name = HORIZON, 0, ""
+        if not len(pairs.bounds):
+            return best, sample, name
+        where = pairs.bounds.argmin(axis=1)
+        least = pairs.bounds[np.arange(where.size), where]
+        while True:
+            row = int(least.argmin())
+            if least[row] >= best - RESOLUTION:
+                return best, sample, name
+            k, i, j = int(where[row]), int(pairs.first[row]), int(pairs.second[row])
+            distance = self.distance(i, j, scene, k)
+            if not distance >= best:
+                best, sample, name = distance, k, f"{self.names[i]} and {self.names[j]}"
+            least[row], where[row] = tighten(pairs.bounds[row], pairs.travel[row], k, distance)
 
-    def _distance(self, pair: _Pair) -> float:
-        objects, oMg = self.geometry.geometryObjects, self.placements.oMg
-        first, second = oMg[pair.first], oMg[pair.second]
+    def distance(self, i: int, j: int, scene: Scene, k: int) -> float:
+        """Exact distance of two bodies at sample k (m)."""
         self.result.clear()
         return coal.distance(
-            objects[pair.first].geometry,
-            coal.Transform3s(first.rotation, first.translation),
-            objects[pair.second].geometry,
-            coal.Transform3s(second.rotation, second.translation),
-            self.request,
-            self.result,
+            self.shapes[i], self._at(i, scene, k), self.shapes[j], self._at(j, scene, k), self.request, self.result
         )
 
-    def pairs(self, first: Iterable[int], second: Iterable[int]) -> list[_Pair]:
-        """All pairs of the two groups, named after both bodies."""
-        names = [body.name for body in self.geometry.geometryObjects]
-        second = list(second)
-        return [_Pair(i, k, f"{names[i]} and {names[k]}") for i in first for k in second]
+    def _at(self, i: int, scene: Scene, k: int) -> coal.Transform3s:
+        if i < len(self.links):
+            link = self.links[i]
+            return coal.Transform3s(scene.R[k, link], scene.p[k, link]) * self.placements[i]
+        if i == self.ground:
+            return coal.Transform3s()
+        return coal.Transform3s(scene.R_part[k], scene.p_part[k])
 
-    def self_pairs(self) -> list[_Pair]:
-        """Pairs of arm and hand that can meet: three or more joints apart; the hand counts as the last link."""
-        n = self.assembly.robot.n
-        link = {i: min(self.geometry.geometryObjects[i].parentJoint, n) for i in self.moving}
-        return [pair for pair in self.pairs(self.moving, self.moving) if link[pair.second] - link[pair.first] >= 3]
 
-    def flange(self) -> pin.SE3:
-        """T_world_flange at the configuration placed last."""
-        return pin.SE3(pin.updateFramePlacement(self.model, self.data, self.assembly.flange_id))
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Poses at S samples: links (S, L, 3, 3), (S, L, 3) and part (S, 3, 3), (S, 3), which is carried from `lifted` on.
+
+    `closing` is the first sample at which the pads may touch the part.
+    """
+
+    R: Array
+    p: Array
+    R_part: Array
+    p_part: Array
+    closing: int
+    lifted: int
+
+
+def _convex(path: Path) -> tuple[coal.Convex, Array]:
+    """A convex piece for Coal, and its vertices (V, 3)."""
+    hull = trimesh.load_mesh(path).convex_hull
+    points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for vertex in hull.vertices:
+        points.append(np.asarray(vertex))
+    for face in hull.faces:
+        faces.append(coal.Triangle(*(int(i) for i in face)))
+    return coal.Convex(points, faces), np.asarray(hull.vertices)
 
 
 @lru_cache(maxsize=8)
-def _cell(task: GraspTask, grasp_name: str) -> CellGeometry:
+def cell_geometry(task: GraspTask, grasp_name: str) -> CellGeometry:
+    """The bodies of a task, made once."""
     return CellGeometry(task, next(g for g in task.grasp_object.grasps if g.name == grasp_name))
 
 
@@ -155,48 +211,115 @@ def clearance_entries(
     Args:
         task: Arm, gripper and part.
         targets: Where the part stands and how it is taken.
-        motion: For each phase its times (M,) on the plan's clock, arm (M, n) and gripper (M, m) positions.
+        motion: For the phases "approach", "grasp" and "deliver" times (M,) on the plan's clock, arm (M, n) and gripper
+            (M, m) positions.
 
     Returns:
         Entries "ground_clearance", "part_clearance", "self_clearance" and, for the carried part against ground and
         arm, "carried_clearance"; distances above `HORIZON` are reported as `HORIZON`.
     """
-    cell = _cell(task, targets.grasp.name)
-    arm = [i for i in cell.moving if i not in cell.hand and cell.geometry.geometryObjects[i].parentJoint > 0]
-    moving = arm + sorted(cell.hand)
-    may_not_touch = sorted(cell.hand - cell.pads)
-    standing = {
-        "ground_clearance": cell.pairs(moving, [cell.ground]),
-        "part_clearance": cell.pairs(moving, cell.pieces),
-        "self_clearance": cell.self_pairs(),
-    }
-    closing = standing | {"part_clearance": cell.pairs(arm + may_not_touch, cell.pieces)}
-    base = [i for i in cell.moving if i not in moving]
-    carried = closing | {"carried_clearance": cell.pairs(cell.pieces, [*base, *arm, cell.ground])}
-    checks = {"approach": standing, "grasp": closing, "deliver": carried}
-
-    worst: dict[str, tuple[float, float, str]] = {}
-    for phase, (times, q, q_h) in motion.items():
-        for k in _spread(q):
-            cell.place(q[k], q_h[k], targets.T_world_object)
-            if phase == "deliver":
-                cell.place_part(cell.flange() * cell.T_flange_object)
-            for name, pairs in checks[phase].items():
-                distance, who = cell.nearest(pairs)
-                if name not in worst or distance < worst[name][0]:
-                    worst[name] = (distance, float(times[k]), who)
-    tolerance = {"carried_clearance": RESTING_TOLERANCE}
+    cell = cell_geometry(task, targets.grasp.name)
+    phases = [motion[name] for name in ("approach", "grasp", "deliver")]
+    chosen = [_spread(np.hstack([q, q_h])) for _, q, q_h in phases]
+    times, q, q_h = (
+        np.concatenate([phase[column][k] for phase, k in zip(phases, chosen, strict=True)]) for column in range(3)
+    )
+    closing = chosen[0].size
+    scene = _scene(cell, q, q_h, targets.part_poses(times), closing, closing + chosen[1].size)
+    if not all(np.isfinite(x).all() for x in (scene.R, scene.p, scene.R_part, scene.p_part)):
+        found = dict.fromkeys(_CHECKS, (np.nan, 0, "poses that are not numbers"))
+    else:
+        world = tracks(scene.R, scene.p, np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3)), cell.capsules)
+        seen = tracks(scene.R, scene.p, scene.R_part, scene.p_part, cell.capsules)
+        candidates = (
+            _over_ground(cell, world),
+            _near_part(cell, scene, seen),
+            _within_arm(cell, world),
+            _carried(cell, scene, seen),
+        )
+        found = {name: cell.nearest(pairs, scene) for name, pairs in zip(_CHECKS, candidates, strict=True)}
+        # The part hangs in the gripper only from the lift on.
+        distance, k, who = found["carried_clearance"]
+        found["carried_clearance"] = distance, max(k, scene.lifted), who
     return [
-        AuditEntry(name, distance, 0.0, True, tolerance.get(name, 0.0), "m", time, who)
-        for name, (distance, time, who) in worst.items()
+        AuditEntry(name, distance, 0.0, True, _CHECKS[name], "m", float(times[k]), who)
+        for name, (distance, k, who) in found.items()
     ]
 
 
-def _spread(q: Array) -> list[int]:
-    """Indices of samples of q (M, n), first and last included, at most `JOINT_STEP` apart where the samples allow it."""
-    chosen = [0]
-    for k in range(1, len(q)):
-        is_last = k == len(q) - 1
-        if is_last or np.abs(q[k + 1] - q[chosen[-1]]).max() > JOINT_STEP:
-            chosen.append(k)
-    return chosen
+# Entries and their tolerances (m).
+_CHECKS = {
+    "ground_clearance": 0.0,
+    "part_clearance": 0.0,
+    "self_clearance": 0.0,
+    "carried_clearance": RESTING_TOLERANCE,
+}
+
+
+def _scene(cell: CellGeometry, q: Array, q_h: Array, standing: tuple[Array, Array], closing: int, lifted: int) -> Scene:
+    R, p = cell.poses(q, q_h)
+    R_part, p_part = standing[0].copy(), standing[1].copy()
+    T = cell.T_flange_object
+    R_part[lifted:] = R[lifted:, -1] @ T.rotation
+    p_part[lifted:] = p[lifted:, -1] + R[lifted:, -1] @ T.translation
+    return Scene(R, p, R_part, p_part, closing, lifted)
+
+
+def _over_ground(cell: CellGeometry, world: Tracks) -> Candidates:
+    bounds = heights(world.ends, cell.capsules.radii, cell.moving)
+    return Candidates(cell.moving, np.full(cell.moving.size, cell.ground), bounds, world.travel[cell.moving])
+
+
+def _near_part(cell: CellGeometry, scene: Scene, seen: Tracks) -> Candidates:
+    """Arm and hand against the pieces; the pads only until they close."""
+    samples = len(scene.R)
+    stops = np.where(cell.is_pad[cell.moving], scene.closing, samples)
+    return _to_pieces(cell, seen, cell.moving, np.zeros_like(stops), stops)
+
+
+def _to_pieces(cell: CellGeometry, seen: Tracks, bodies: Indices, starts: Indices, stops: Indices) -> Candidates:
+    first, box, bounds = near_boxes(
+        seen.ends, seen.travel, cell.capsules.radii, bodies, starts, stops, cell.low, cell.high, HORIZON
+    )
+    return Candidates(first, len(cell.links) + box, bounds, seen.travel[first])
+
+
+def _within_arm(cell: CellGeometry, world: Tracks) -> Candidates:
+    first, second = cell.self_pairs
+    kept, bounds = near_capsules(world.ends, world.travel, cell.capsules.radii, first, second, HORIZON)
+    first, second = first[kept], second[kept]
+    return Candidates(first, second, bounds, world.travel[first] + world.travel[second])
+
+
+def _carried(cell: CellGeometry, scene: Scene, seen: Tracks) -> Candidates:
+    """The pieces of the part against arm, base and ground, once it is lifted."""
+    bodies, samples = cell.arm_and_base, len(scene.R)
+    starts, stops = np.full(bodies.size, scene.lifted), np.full(bodies.size, samples)
+    arm = _to_pieces(cell, seen, bodies, starts, stops)
+    up, origin = np.ascontiguousarray(scene.R_part[:, 2]), np.ascontiguousarray(scene.p_part[:, 2])
+    bounds = box_heights(up, origin, cell.low, cell.high, scene.lifted)
+    pieces = np.arange(len(cell.low)) + len(cell.links)
+    # A height above the ground is bounded well enough at every sample by itself.
+    apart: Array = np.tile(np.arange(samples) * 1e9, (pieces.size, 1)).astype(float)
+    return Candidates(
+        np.concatenate([arm.first, pieces]),
+        np.concatenate([arm.second, np.full(pieces.size, cell.ground)]),
+        np.concatenate([arm.bounds, bounds]),
+        np.concatenate([arm.travel, apart]),
+    )
+
+
+@njit(cache=True)
+def _spread(q: Array) -> Indices:
+    """Indices of samples of q (M, n), first and last included, `JOINT_STEP` apart or less if the samples allow it."""
+    chosen = np.empty(q.shape[0], np.int64)
+    chosen[0], used = 0, 1
+    for k in range(1, q.shape[0]):
+        keep = k == q.shape[0] - 1
+        for i in range(q.shape[1]):
+            # A step that is not a number is kept, for the check of the poses to find.
+            keep = keep or not abs(q[min(k + 1, q.shape[0] - 1), i] - q[chosen[used - 1], i]) <= JOINT_STEP
+        if keep:
+            chosen[used] = k
+            used += 1
+    return chosen[:used]

@@ -12,7 +12,7 @@ import pinocchio as pin
 from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.grasp_object import Grasp, GraspObject
 from dyngrasp.models.gripper import GripperModel
-from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity
+from dyngrasp.models.inverse_kinematics import InverseKinematics, inverse_kinematics_for, joint_velocity
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.signals import Array, read_only
 
@@ -83,20 +83,59 @@ class GraspTask:
         object.__setattr__(self, "place", read_only(self.place, (self.robot.n,)))
 
     @cached_property
+    def kinematics(self) -> InverseKinematics:
+        """Inverse kinematics of the arm."""
+        return inverse_kinematics_for(self.robot)
+
+    @cached_property
     def robot_empty(self) -> RobotModel:
         """The arm with the open gripper as a rigid payload."""
         return self._carrying_gripper(self.gripper.open_posture)
 
     def robot_loaded(self, grasp: Grasp) -> RobotModel:
         """The arm with the closed gripper and the part in `grasp` as rigid payloads."""
-        closed = self.closed_posture(grasp)
-        T_flange_grasp = self.gripper.T_flange_hand * self.gripper.T_hand_grasp(closed)
-        T_flange_object = T_flange_grasp * grasp.T_object_grasp.inverse()
-        return self._carrying_gripper(closed).with_payload(T_flange_object.act(self.grasp_object.spatial_inertia))
+        if grasp not in self._loaded:
+            closed = self.closed_posture(grasp)
+            T_flange_object = self.T_flange_closed(grasp) * grasp.T_object_grasp.inverse()
+            loaded = self._carrying_gripper(closed).with_payload(T_flange_object.act(self.grasp_object.spatial_inertia))
+            self._loaded[grasp] = loaded
+        return self._loaded[grasp]
 
     def closed_posture(self, grasp: Grasp) -> Array:
-        """(m,) posture of the gripper around the part, a little narrower than the part so that it presses."""
-        return self.gripper.posture_for(grasp.width - self.settings.over_close)
+        """(m,) posture of the gripper around the part, a little narrower than the part so that it presses.
+
+        Raises:
+            GraspRefused: The gripper does not close or open that far.
+        """
+        if grasp.width not in self._closed:
+            posture = self.gripper.posture_for(grasp.width - self.settings.over_close)
+            self._closed[grasp.width] = read_only(posture)
+        return self._closed[grasp.width]
+
+    @cached_property
+    def T_flange_open(self) -> pin.SE3:
+        """The grasp frame in the flange frame with the gripper open."""
+        return self.gripper.T_flange_hand * self.gripper.T_hand_grasp(self.gripper.open_posture)
+
+    def T_flange_closed(self, grasp: Grasp) -> pin.SE3:
+        """The grasp frame in the flange frame with the gripper closed around the part."""
+        closed = self.closed_posture(grasp)
+        if grasp.width not in self._T_flange_closed:
+            self._T_flange_closed[grasp.width] = self.gripper.T_flange_hand * self.gripper.T_hand_grasp(closed)
+        return self._T_flange_closed[grasp.width]
+
+    # Planning asks for these again and again: they change with the grasp alone.
+    @cached_property
+    def _loaded(self) -> dict[Grasp, RobotModel]:
+        return {}
+
+    @cached_property
+    def _closed(self) -> dict[float, Array]:
+        return {}
+
+    @cached_property
+    def _T_flange_closed(self) -> dict[float, pin.SE3]:
+        return {}
 
     def _carrying_gripper(self, posture: Array) -> RobotModel:
         return self.robot.with_payload(self.gripper.T_flange_hand.act(self.gripper.inertia(posture)))
@@ -125,6 +164,9 @@ class GraspTargets:
         grasped: End of the grasp: closed gripper, G on the grasp frame, moving up along world z.
         place: End of the delivery: the target configuration, at rest.
         gripper_open, gripper_closed: (m,) gripper postures before and after the grasp (rad).
+        grasp_time: When a moving part is at `T_world_object`: at the grasp (s). Without meaning for a part at rest.
+        twist_world: (6,) velocity of the object frame's origin (m/s) and angular velocity (rad/s) of the part, in world
+            axes.
     """
 
     T_world_object: pin.SE3
@@ -134,11 +176,50 @@ class GraspTargets:
     place: BoundaryState
     gripper_open: Array
     gripper_closed: Array
+    grasp_time: float = 0.0
+    twist_world: Array = field(default_factory=lambda: np.zeros(6))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "twist_world", read_only(self.twist_world, (6,)))
 
     @property
     def T_world_grasp(self) -> pin.SE3:
         """The grasp frame in the world: z outward along the approach axis, y along the closing axis."""
         return self.T_world_object * self.grasp.T_object_grasp
+
+    @cached_property
+    def moving(self) -> bool:
+        """Whether the part moves."""
+        return bool(np.any(self.twist_world))
+
+    def T_world_object_at(self, t: float) -> pin.SE3:
+        """Pose of the part at time t (s): it keeps its velocities until it is taken at `grasp_time`."""
+        if not self.moving or t >= self.grasp_time:
+            return self.T_world_object
+        return moved(self.T_world_object, self.twist_world, t - self.grasp_time)
+
+    def part_poses(self, times: Array) -> tuple[Array, Array]:
+        """`T_world_object_at` for many times (M,): rotations (M, 3, 3) and positions (M, 3)."""
+        R, p = self.T_world_object.rotation, self.T_world_object.translation
+        if not self.moving:
+            return np.broadcast_to(R, (times.size, 3, 3)), np.broadcast_to(p, (times.size, 3))
+        dt = np.minimum(times - self.grasp_time, 0.0)
+        velocity, spin = self.twist_world[:3], pin.skew(self.twist_world[3:])
+        rate = float(np.linalg.norm(self.twist_world[3:]))
+        if rate > 0.0:
+            axis = spin / rate
+            angle = (rate * dt)[:, None, None]
+            turn = np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)
+        else:
+            turn = np.broadcast_to(np.eye(3), (times.size, 3, 3))
+        return turn @ R, p + dt[:, None] * velocity
+
+
+def moved(T_world_object: pin.SE3, twist_world: Array, dt: float) -> pin.SE3:
+    """Where a body is after `dt` (s), before for dt < 0, with constant velocities of its origin and about it."""
+    return pin.SE3(
+        pin.exp3(dt * twist_world[3:]) @ T_world_object.rotation, T_world_object.translation + dt * twist_world[:3]
+    )
 
 
 def grasp_targets(T_world_object: pin.SE3, task: GraspTask, q_start: Array) -> GraspTargets:
@@ -168,24 +249,29 @@ def ranked_grasp_targets(T_world_object: pin.SE3, task: GraspTask, q_start: Arra
     """
     refusals: list[GraspRefused] = []
     unreachable: list[OutOfReach] = []
-    candidates: list[tuple[float, Grasp, Array]] = []
+    postures: list[Array] = []
+    grasps: list[Grasp] = []
     for grasp in task.grasp_object.grasps:
         try:
             check_grasp(grasp, T_world_object, task)
-            postures = _grasp_postures(grasp, T_world_object, task)
+            postures.append(_grasp_postures(grasp, T_world_object, task))
         except GraspRefused as refusal:
             refusals.append(refusal)
         except OutOfReach as failure:
             unreachable.append(failure)
         else:
-            candidates += [(_travel_time(q, q_start, task), grasp, q) for q in postures]
-    if not candidates:
+            grasps += [grasp] * len(postures[-1])
+    if not grasps:
         raise unreachable[0] if unreachable else refusals[0]
-    candidates.sort(key=lambda candidate: candidate[0])
+    candidates = np.concatenate(postures)
     yielded: list[Array] = []
-    failure: OutOfReach | None = None
-    for _, grasp, q in candidates:
+    failure = None
+    for k in np.argsort(_travel_times(candidates, q_start, task), kind="stable"):
+        q, grasp = candidates[k], grasps[k]
         if any(np.abs(q - other).max() < _DISTINCT for other in yielded):
+            continue
+        # Asked only of those that are wanted: it costs more than the rest of the choice.
+        if np.linalg.svd(task.robot.jacobian(q), compute_uv=False)[-1] < task.settings.dexterity_min:
             continue
         try:
             targets = _targets_at(q, grasp, T_world_object, task, q_start)
@@ -195,7 +281,7 @@ def ranked_grasp_targets(T_world_object: pin.SE3, task: GraspTask, q_start: Arra
         yielded.append(q)
         yield targets
     if not yielded:
-        raise failure or OutOfReach("the pre-grasp", 0.0, "no posture")
+        raise failure or _no_posture(grasps[0], task)
 
 
 # Postures closer than this (rad, max-norm) lead to the same motion; the next candidate should be another one.
@@ -236,54 +322,51 @@ def check_grasp(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> None:
         )
 
 
-def _flange_poses(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> tuple[pin.SE3, pin.SE3]:
+def flange_poses(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> tuple[pin.SE3, pin.SE3]:
     """Flange poses at the pre-grasp (open gripper) and at the grasp (closed): they differ by the travel of G."""
-    gripper = task.gripper
     T_world_grasp = T_world_object * grasp.T_object_grasp
     above = pin.SE3(np.eye(3), np.array([0.0, 0.0, task.settings.pregrasp_distance]))
-    open_hand = gripper.T_flange_hand * gripper.T_hand_grasp(gripper.open_posture)
-    closed_hand = gripper.T_flange_hand * gripper.T_hand_grasp(task.closed_posture(grasp))
-    return T_world_grasp * above * open_hand.inverse(), T_world_grasp * closed_hand.inverse()
+    closed = task.T_flange_closed(grasp)
+    return T_world_grasp * above * task.T_flange_open.inverse(), T_world_grasp * closed.inverse()
 
 
 def _grasp_postures(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> Array:
-    """(k, n) configurations at the grasp that keep clear of limits and singularities."""
-    robot, settings = task.robot, task.settings
-    _, T_world_flange = _flange_poses(grasp, T_world_object, task)
-    postures = inverse_kinematics_for(robot).solutions(T_world_flange)
-    margin = settings.limit_margin
-    inside = (postures >= robot.limits.position_lower + margin) & (postures <= robot.limits.position_upper - margin)
+    """(k, n) configurations at the grasp that keep clear of the joint limits, k ≥ 1."""
+    limits, margin = task.robot.limits, task.settings.limit_margin
+    _, T_world_flange = flange_poses(grasp, T_world_object, task)
+    postures = task.kinematics.solutions(T_world_flange)
+    inside = (postures >= limits.position_lower + margin) & (postures <= limits.position_upper - margin)
     postures = postures[inside.all(axis=1)]
-    dexterity = np.array([np.linalg.svd(robot.jacobian(q), compute_uv=False)[-1] for q in postures])
-    postures = postures[dexterity >= settings.dexterity_min]
     if not len(postures):
-        raise OutOfReach(
-            f"grasp {grasp.name!r} of {task.grasp_object.name}",
-            0.0,
-            f"no posture keeps {np.rad2deg(margin):.0f}° from the joint limits and clear of singularities",
-        )
+        raise _no_posture(grasp, task)
     return postures
 
 
-def _travel_time(q: Array, q_start: Array, task: GraspTask) -> float:
-    """Time of the slowest joint at top speed from the start to `q` and on to the target (s)."""
+def _no_posture(grasp: Grasp, task: GraspTask) -> OutOfReach:
+    margin = np.rad2deg(task.settings.limit_margin)
+    reason = f"no posture keeps {margin:.0f}° from the joint limits and clear of singularities"
+    return OutOfReach(f"grasp {grasp.name!r} of {task.grasp_object.name}", 0.0, reason)
+
+
+def _travel_times(postures: Array, q_start: Array, task: GraspTask) -> Array:
+    """(k,) time of the slowest joint at top speed from the start to each posture (k, n) and on to the target (s)."""
     speed = task.robot.limits.velocity
-    return float((np.abs(q - q_start) / speed).max() + (np.abs(task.place - q) / speed).max())
+    return (np.abs(postures - q_start) / speed).max(axis=1) + (np.abs(task.place - postures) / speed).max(axis=1)
 
 
 def _targets_at(q: Array, grasp: Grasp, T_world_object: pin.SE3, task: GraspTask, q_start: Array) -> GraspTargets:
     robot, settings = task.robot, task.settings
-    T_pregrasp, _ = _flange_poses(grasp, T_world_object, task)
+    T_pregrasp, _ = flange_poses(grasp, T_world_object, task)
     approach_axis = (T_world_object * grasp.T_object_grasp).rotation[:, 2]
 
-    swivel = _swivel_velocity(q, q_start, task)
+    swivel = swivel_velocity(q, q_start, task)
     # A symmetric reversal covers the swivel rate times the duration; the pre-grasp posture lies that far back.
     q_before = q - swivel * (settings.grasp_duration_min + settings.grasp_duration_max) / 2
-    q_pregrasp = inverse_kinematics_for(robot).nearest(T_pregrasp, q_before)
+    q_pregrasp = task.kinematics.nearest(T_pregrasp, q_before)
 
     lift = np.array([0.0, 0.0, settings.lift_speed, 0.0, 0.0, 0.0])
     approach = np.concatenate([-settings.approach_speed * approach_axis, np.zeros(3)])
-    swivel_before = _swivel_velocity(q_pregrasp, q_start, task, like=swivel)
+    swivel_before = swivel_velocity(q_pregrasp, q_start, task, like=swivel)
     return GraspTargets(
         T_world_object=T_world_object,
         grasp=grasp,
@@ -295,12 +378,12 @@ def _targets_at(q: Array, grasp: Grasp, T_world_object: pin.SE3, task: GraspTask
     )
 
 
-def _swivel_velocity(q: Array, q_start: Array, task: GraspTask, like: Array | None = None) -> Array:
+def swivel_velocity(q: Array, q_start: Array, task: GraspTask, like: Array | None = None) -> Array:
     """(n,) null-space velocity that keeps the arm moving through the grasp (rad/s); zero if there is no null space.
 
     It turns the way the motion from start to target goes on the whole, or the way of `like` if given.
     """
-    rate = inverse_kinematics_for(task.robot).null_space_rate(q)
+    rate = task.kinematics.null_space_rate(q)
     ratio = float(np.abs(rate / task.robot.limits.velocity).max())
     if ratio == 0.0:
         return np.zeros_like(q)

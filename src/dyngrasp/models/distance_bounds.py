@@ -1,0 +1,312 @@
+"""Cheap lower bounds of the distance between bodies that move, for many samples at once, compiled.
+
+A body is bounded by a capsule (a segment with a radius), a convex piece by the box along its own axes. What a body can
+have moved from one sample to another bounds how much any of its distances can have changed: after a sample that is far
+the next ones are skipped, and one exact distance says something about its neighbours.
+
+Bounds hold for signed distances: a penetration counts negative with the depth by which the bodies would have to part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from dyngrasp.signals import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Capsules:
+    """Bounding capsules of B bodies.
+
+    Attributes:
+        links: (B,) index of the frame that each is fixed to.
+        ends: (B, 2, 3) ends of the segments in that frame (m).
+        radii: (B,) m.
+    """
+
+    links: NDArray[np.int64]
+    ends: Array
+    radii: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """How B bodies move through S samples, seen from one frame.
+
+    Attributes:
+        ends: (B, 2, 3, S) ends of the segments (m).
+        travel: (B, S) path that the fastest point of each body has covered since the first sample, at most (m).
+    """
+
+    ends: Array
+    travel: Array
+
+
+def bounding_capsule(shape: Any) -> tuple[Array, float]:
+    """Segment ends (2, 3) and radius (m), in the frame of the shape, of a capsule that contains it.
+
+    Args:
+        shape: A primitive or a mesh of Coal.
+    """
+    if isinstance(shape, coal.Capsule | coal.Cylinder):
+        return _along(2, shape.halfLength), float(shape.radius)
+    if isinstance(shape, coal.Sphere):
+        return np.zeros((2, 3)), float(shape.radius)
+    if isinstance(shape, coal.Box):
+        half = np.asarray(shape.halfSide, dtype=float).ravel()
+        longest = int(np.argmax(half))
+        return _along(longest, half[longest]), float(np.linalg.norm(np.delete(half, longest)))
+    if isinstance(shape, coal.Ellipsoid):
+        radii = np.asarray(shape.radii, dtype=float).ravel()
+        longest, second = int(np.argmax(radii)), float(np.sort(radii)[1])
+        return _along(longest, radii[longest] - second), second
+    points = np.asarray(shape.points() if isinstance(shape, coal.ConvexBase) else shape.vertices(), dtype=float)
+    centre = points.mean(axis=0)
+    axis = np.linalg.svd(points - centre, full_matrices=False)[2][0]
+    along = (points - centre) @ axis
+    radius = np.linalg.norm(points - centre - along[:, None] * axis, axis=1).max()
+    return centre + np.array([[along.min()], [along.max()]]) * axis, float(radius)
+
+
+def _along(axis: int, half: float) -> Array:
+    ends = np.zeros((2, 3))
+    ends[:, axis] = -half, half
+    return ends
+
+
+def tracks(R: Array, p: Array, R_view: Array, p_view: Array, capsules: Capsules) -> Tracks:
+    """How bodies move as seen from a frame that may move as well.
+
+    Args:
+        R: (S, L, 3, 3) rotations of the links.
+        p: (S, L, 3) their positions (m).
+        R_view: (S, 3, 3) rotations of the frame to look from.
+        p_view: (S, 3) its positions (m).
+        capsules: The bodies.
+    """
+    return Tracks(*_tracks(R, p, R_view, p_view, capsules.links, capsules.ends, capsules.radii))
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _tracks(R, p, R_view, p_view, links, body_ends, radii):
+    samples, count, bodies = R.shape[0], R.shape[1], links.size
+    ends, travel = np.empty((bodies, 2, 3, samples)), np.empty((bodies, samples))
+    turn, last = np.empty((count, 3, 3)), np.empty((count, 3, 3))
+    shift, step = np.empty((count, 3)), np.zeros(count)
+    for s in range(samples):
+        V, o = R_view[s], p_view[s]
+        for k in range(count):
+            change = 0.0
+            dx, dy, dz = p[s, k, 0] - o[0], p[s, k, 1] - o[1], p[s, k, 2] - o[2]
+            for a in range(3):
+                shift[k, a] = V[0, a] * dx + V[1, a] * dy + V[2, a] * dz
+                for b in range(3):
+                    x = V[0, a] * R[s, k, 0, b] + V[1, a] * R[s, k, 1, b] + V[2, a] * R[s, k, 2, b]
+                    change += (x - last[k, a, b]) ** 2
+                    last[k, a, b] = x
+                    turn[k, a, b] = x
+            # 2 sin(θ/2) of the turn since the last sample: its Frobenius norm over √2.
+            step[k] = np.sqrt(change / 2)
+        for i in range(bodies):
+            k = links[i]
+            farthest = 0.0
+            for e in range(2):
+                t = body_ends[i, e]
+                moved = 0.0
+                for a in range(3):
+                    x = shift[k, a] + turn[k, a, 0] * t[0] + turn[k, a, 1] * t[1] + turn[k, a, 2] * t[2]
+                    ends[i, e, a, s] = x
+                    if s > 0:
+                        moved += (x - ends[i, e, a, s - 1]) ** 2
+                farthest = max(farthest, moved)
+            # Displacement is affine in the point, so within the segment it is largest at an end.
+            travel[i, s] = travel[i, s - 1] + np.sqrt(farthest) + radii[i] * step[k] if s > 0 else 0.0
+    return ends, travel
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _box_gap(ends, s, low, high):
+    """Distance between the box around the segment at sample s and a box; −inf if they overlap."""
+    gap = 0.0
+    for a in range(3):
+        u, v = ends[0, a, s], ends[1, a, s]
+        d = max(low[a] - max(u, v), min(u, v) - high[a], 0.0)
+        gap += d * d
+    # How deep two bodies are in each other, overlapping boxes do not say.
+    return np.sqrt(gap) if gap > 0.0 else -np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def near_boxes(ends, travel, radii, bodies, starts, stops, low, high, horizon):
+    """Pairs of a body and a box that may come nearer than `horizon`, and lower bounds for them.
+
+    Args:
+        ends: Of the `Tracks` in the frame of the boxes.
+        travel: Of the same.
+        radii: (B,) m.
+        bodies: (K,) which bodies.
+        starts: (K,) first sample that counts for each of them.
+        stops: (K,) one after the last.
+        low: (P, 3) lower corners of the boxes (m).
+        high: (P, 3) upper corners (m).
+        horizon: m.
+
+    Returns:
+        Bodies, boxes, bounds (rows, S), inf where a sample does not count or is known to be farther than the horizon.
+    """
+    samples, count = travel.shape[1], low.shape[0]
+    rows = np.empty((bodies.size * count, samples))
+    first, second = np.empty(bodies.size * count, np.int64), np.empty(bodies.size * count, np.int64)
+    around_low, around_high = np.empty(3), np.empty(3)
+    for a in range(3):
+        around_low[a], around_high[a] = low[:, a].min(), high[:, a].max()
+    used = 0
+    for n in range(bodies.size):
+        b = bodies[n]
+        comes_near = False
+        s = starts[n]
+        while s < stops[n] and not comes_near:
+            room = _box_gap(ends[b], s, around_low, around_high) - radii[b] - horizon
+            comes_near = not room >= 0.0
+            reach = travel[b, s] + room
+            s += 1
+            while s < stops[n] and travel[b, s] <= reach:
+                s += 1
+        if not comes_near:
+            continue
+        begin = s - 1
+        for i in range(count):
+            row = rows[used]
+            row[:] = np.inf
+            keep = False
+            s = begin
+            while s < stops[n]:
+                bound = _box_gap(ends[b], s, low[i], high[i]) - radii[b]
+                if bound < horizon:
+                    row[s] = bound
+                    keep = True
+                    s += 1
+                else:
+                    reach = travel[b, s] + bound - horizon
+                    s += 1
+                    while s < stops[n] and travel[b, s] <= reach:
+                        s += 1
+            if keep:
+                first[used], second[used] = b, i
+                used += 1
+    return first[:used], second[:used], rows[:used]
+
+
+@njit(cache=True, error_model="numpy")
+def near_capsules(ends, travel, radii, first, second, horizon):
+    """Pairs of bodies (K,), (K,) that may come nearer to each other than `horizon`; as `near_boxes`."""
+    samples = travel.shape[1]
+    rows = np.empty((first.size, samples))
+    kept = np.empty(first.size, np.int64)
+    used = 0
+    for n in range(first.size):
+        i, k = first[n], second[n]
+        row = rows[used]
+        row[:] = np.inf
+        keep = False
+        s = 0
+        while s < samples:
+            bound = _segment_distance(ends[i], ends[k], s) - radii[i] - radii[k]
+            if bound < horizon:
+                row[s] = bound
+                keep = True
+                s += 1
+            else:
+                reach = travel[i, s] + travel[k, s] + bound - horizon
+                s += 1
+                while s < samples and travel[i, s] + travel[k, s] <= reach:
+                    s += 1
+        if keep:
+            kept[used] = n
+            used += 1
+    return kept[:used], rows[:used]
+
+
+@njit(cache=True, error_model="numpy")
+def _segment_distance(one, other, s):
+    """Distance of two segments at sample s: where the lines come nearest, each parameter clamped in turn."""
+    px, py, pz = one[0, 0, s], one[0, 1, s], one[0, 2, s]
+    ux, uy, uz = one[1, 0, s] - px, one[1, 1, s] - py, one[1, 2, s] - pz
+    qx, qy, qz = other[0, 0, s], other[0, 1, s], other[0, 2, s]
+    vx, vy, vz = other[1, 0, s] - qx, other[1, 1, s] - qy, other[1, 2, s] - qz
+    wx, wy, wz = px - qx, py - qy, pz - qz
+    a, e = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
+    b, c, f = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+    denominator = a * e - b * b
+    x = 0.0
+    if a > 0.0:
+        # Parallel segments: any start serves, the clamping below finds the nearest pair.
+        x = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 1e-14 * a * e else 0.0
+    y = (b * x + f) / e if e > 0.0 else 0.0
+    if y < 0.0 or y > 1.0 or e == 0.0:
+        y = min(max(y, 0.0), 1.0)
+        x = min(max((b * y - c) / a, 0.0), 1.0) if a > 0.0 else 0.0
+    dx, dy, dz = wx + x * ux - y * vx, wy + x * uy - y * vy, wz + x * uz - y * vz
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@njit(cache=True, error_model="numpy")
+def heights(ends, radii, bodies):
+    """(K, S) height of the lowest point of the capsules of some bodies, seen from the world."""
+    rows = np.empty((bodies.size, ends.shape[3]))
+    for n in range(bodies.size):
+        b = bodies[n]
+        for s in range(ends.shape[3]):
+            rows[n, s] = min(ends[b, 0, 2, s], ends[b, 1, 2, s]) - radii[b]
+    return rows
+
+
+@njit(cache=True, error_model="numpy")
+def box_heights(up, origin, low, high, start):
+    """(P, S) height of the lowest corner of boxes (P, 3), (P, 3) in a frame; inf before sample `start`.
+
+    Args:
+        up: (S, 3) the world's z axis in that frame.
+        origin: (S,) height of its origin (m).
+        low: (P, 3) lower corners in that frame (m).
+        high: (P, 3) upper corners (m).
+        start: First sample that counts.
+    """
+    rows = np.full((low.shape[0], origin.size), np.inf)
+    for i in range(low.shape[0]):
+        for s in range(start, origin.size):
+            z = origin[s]
+            for a in range(3):
+                z += min(up[s, a] * low[i, a], up[s, a] * high[i, a])
+            rows[i, s] = z
+    return rows
+
+
+@njit(cache=True, error_model="numpy")
+def tighten(row, travel, at, distance):
+    """Enter an exact distance into a row of bounds, as its neighbours see it; `at` itself is done (inf).
+
+    Args:
+        row: (S,) bounds, changed in place.
+        travel: (S,) combined path of both bodies (m).
+        at: The sample that was measured.
+        distance: What was measured (m).
+
+    Returns:
+        Least bound that is left, and where.
+    """
+    row[at] = np.inf
+    least, where = np.inf, 0
+    for s in range(row.size):
+        bound = distance - abs(travel[s] - travel[at])
+        if bound > row[s]:
+            row[s] = bound
+        if row[s] < least:
+            least, where = row[s], s
+    return least, where
