@@ -6,6 +6,7 @@ import pytest
 
 from dyngrasp.closed_loop.episode import EpisodeSettings
 from dyngrasp.closed_loop.record import ARRAY_NAMES
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.experiments.metrics import judge
 from dyngrasp.simulation.plant import ContactCategory
 
@@ -92,3 +93,8 @@ def test_progress_is_reported_in_order(planned):
     assert times == sorted(times)
     assert len(seen) == pytest.approx(planned.plan.end_time * 20, abs=1.5)
     assert list(dict.fromkeys(phase for _, phase in seen)) == ["approach", "grasp", "deliver"]
+
+
+def test_a_plant_with_another_step_than_the_clock_is_refused(planned):
+    with pytest.raises(InvalidProblem, match="control period"):
+        planned.run(settings=EpisodeSettings(control_period=0.5e-3))

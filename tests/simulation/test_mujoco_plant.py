@@ -6,7 +6,7 @@ import pytest
 
 from dyngrasp.signals import Command
 from dyngrasp.simulation.mujoco_plant import SensorSettings
-from dyngrasp.simulation.plant import ContactCategory, Plant
+from dyngrasp.simulation.plant import ContactCategory, Plant, PlantDiverged
 
 POSTURE = np.deg2rad([20.0, 30.0, 10.0, -80.0, 10.0, 60.0, 20.0])
 
@@ -145,3 +145,23 @@ def test_an_exact_sensor_reads_the_true_state(scene, make_plant):
     np.testing.assert_array_equal(plant.observe().arm_position, POSTURE)
     plant.step(limp(scene))
     np.testing.assert_array_equal(plant.observe().arm_position, plant.truth().arm_position)
+
+
+def test_a_torque_that_is_no_number_is_refused(scene, make_plant):
+    plant = make_plant(scene)
+    with pytest.raises(PlantDiverged, match="not finite"):
+        plant.step(Command(np.full(7, np.nan), np.zeros(4)))
+
+
+def test_an_unstable_simulation_is_reported_and_not_restarted(scene, make_plant, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plant = make_plant(scene)
+    plant._data.qvel[scene.arm_dof] = 1e12
+    with pytest.raises(PlantDiverged, match="simulation failed at"):
+        step_often(plant)
+    assert list(tmp_path.iterdir()) == []  # no log file in the user's folder
+
+
+def step_often(plant):
+    for _ in range(10):
+        plant.step(limp(plant.scene))

@@ -11,6 +11,7 @@ from dyngrasp.closed_loop.record import EpisodeRecord, Recorder
 from dyngrasp.control.computed_torque import ComputedTorque, ComputedTorqueSettings
 from dyngrasp.control.grasp_controller import Controller, GraspController
 from dyngrasp.control.gripper_control import GripperController, GripperControlSettings
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTask
 from dyngrasp.simulation.plant import TruthfulPlant
@@ -76,6 +77,9 @@ def run_episode(
         settings: Rates.
         progress: Called at every recorded sample with the time (s) and the name of the phase.
         meta: Kept with the record.
+
+    Raises:
+        InvalidProblem: Plant and clock disagree about the time.
     """
     settings = settings or EpisodeSettings()
     clock = Clock(
@@ -84,6 +88,11 @@ def run_episode(
     recorder = Recorder(plan.arm_joints, plan.gripper_joints, settings.control_period)
     for tick in clock:
         observed = plant.observe()
+        if abs(observed.t - tick.t) > settings.control_period / 2:
+            raise InvalidProblem(
+                f"episode: the plant's time is {observed.t:.6f} s where the clock's is {tick.t:.6f} s; its step must be "
+                f"the control period of {settings.control_period:g} s and its start that of the plan"
+            )
         # Between observing and sampling the plan is where a pose source and a replanner take their turn.
         sample = plan.sample(tick.t)
         command = controller.command(observed, sample)

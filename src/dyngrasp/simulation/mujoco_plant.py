@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import mujoco
@@ -10,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from dyngrasp.signals import Array, Command, Observation
-from dyngrasp.simulation.plant import ContactCategory, Truth
+from dyngrasp.simulation.plant import ContactCategory, PlantDiverged, Truth
 from dyngrasp.simulation.scene import Scene
 
 # Category of a contact by the kinds of its two geoms (0 ground, 1 part, 2 pad, 3 the rest of the robot).
@@ -27,6 +28,21 @@ _CATEGORY = {
 _CATEGORY_TABLE = np.full((4, 4), -1)
 for (_a, _b), _category in _CATEGORY.items():
     _CATEGORY_TABLE[_a, _b] = _CATEGORY_TABLE[_b, _a] = _category
+
+_FATAL = np.array(
+    [
+        mujoco.mjtWarning.mjWARN_CONTACTFULL,
+        mujoco.mjtWarning.mjWARN_CNSTRFULL,
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    ],
+    dtype=int,
+)
+
+if mujoco.get_mju_user_warning() is None:
+    # MuJoCo's own habit is to write MUJOCO_LOG.TXT into whatever folder the user works in.
+    mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
 
 
 @dataclass(frozen=True)
@@ -108,12 +124,21 @@ class MujocoPlant:
         return self._observation
 
     def step(self, command: Command) -> None:
-        """Apply torques, saturated at what the motors can give, for one time step."""
+        """Apply torques, saturated at what the motors can give, for one time step.
+
+        Raises:
+            PlantDiverged: A torque that is not finite, or a simulation that became unstable or ran out of memory.
+        """
         scene, data = self.scene, self._data
         data.ctrl[self._arm] = np.clip(command.arm_torque, -scene.arm_torque_limit, scene.arm_torque_limit)
         limit = scene.gripper_torque_limit
         data.ctrl[self._gripper] = np.clip(command.gripper_torque, -limit, limit)
+        if not np.isfinite(data.ctrl).all():
+            raise PlantDiverged(f"a torque that is not finite was commanded at {self.t:.4f} s")
         mujoco.mj_step(scene.model, data)
+        if data.warning.number[_FATAL].any():
+            what = mujoco.mju_warningText(int(_FATAL[data.warning.number[_FATAL].argmax()]), 0)
+            raise PlantDiverged(f"simulation failed at {self.t:.4f} s: {what}")
 
     @property
     def applied(self) -> Command:

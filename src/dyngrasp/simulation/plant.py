@@ -8,7 +8,12 @@ from typing import Protocol, runtime_checkable
 
 import pinocchio as pin
 
+from dyngrasp.errors import DyngraspError
 from dyngrasp.signals import Array, Command, Observation, read_only
+
+
+class PlantDiverged(DyngraspError):
+    """The simulation left the realm of numbers, or was given a command that is none; its state is not to be trusted."""
 
 
 @runtime_checkable

@@ -28,8 +28,8 @@ class View:
         fov_deg: Vertical field of view.
     """
 
-    lookat: tuple[float, float, float] = (0.34, 0.0, 0.40)
-    distance: float = 1.8
+    lookat: tuple[float, float, float] = (0.34, 0.0, 0.45)
+    distance: float = 1.95
     azimuth_deg: float = 132.0
     elevation_deg: float = -18.0
     fov_deg: float = 38.0

@@ -135,6 +135,8 @@ def _set_numerics(spec: MjSpec, settings: SceneSettings) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = settings.impratio
+    # By default MuJoCo puts an unstable simulation back to its start and goes on: nothing here is teleported.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     # Inertia comes from the files alone: shapes drawn for the eye must not add any.
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     spec.compiler.degree = False
