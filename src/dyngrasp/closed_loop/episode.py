@@ -90,7 +90,7 @@ def run_episode(
         observed = plant.observe()
         if abs(observed.t - tick.t) > settings.control_period / 2:
             raise InvalidProblem(
-                f"episode: the plant's time is {observed.t:.6f} s where the clock's is {tick.t:.6f} s; its step must be "
+                f"episode: the plant is at {observed.t:.6f} s, the clock at {tick.t:.6f} s; the plant's step must be "
                 f"the control period of {settings.control_period:g} s and its start that of the plan"
             )
         # Between observing and sampling the plan is where a pose source and a replanner take their turn.
