@@ -12,7 +12,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.joint_splines import TAPS, factorise, pull_back, push_forward, substitute
+from dyngrasp.planning.replanning.joint_splines import (
+    TAPS,
+    factorise,
+    product,
+    pull_back,
+    push_forward,
+    substitute,
+    weigh,
+)
 from dyngrasp.signals import Array
 
 # Beyond this a bound is none (rad, rad/s, rad/s²): nothing that moves in a cell comes near it.
@@ -22,7 +30,9 @@ OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NONFINITE = 0, 1, 2, 3
 
 
 @njit(cache=True, error_model="numpy")
-def bound(kind: int, k: int, j: int, sign: float, T_lin: float, boxes: Array, rates: Array) -> tuple[float, float, float]:
+def bound(
+    kind: int, k: int, j: int, sign: float, T_lin: float, boxes: Array, rates: Array
+) -> tuple[float, float, float]:
     """b, c and 1/scale of the row (b + c (T − T_lin) − sign z) / scale ≥ 0.
 
     Args:
@@ -81,6 +91,7 @@ def interior_point(
     taps: Array,
     base: Array,
     weights: Array,
+    node_weights: Array,
     slope: Array,
     by_T: Array,
     stiffness_T: float,
@@ -106,6 +117,7 @@ def interior_point(
         first, taps: Of `filters`.
         base: (N−1, 3, n) band of the Hessian of the cost.
         weights: (3, n) weights of q, w, a in the cost.
+        node_weights: (K,) added to the weight of q at each grid point.
         slope: (3, K, n) how q, w, a change with T at constant x.
         by_T: (3, K, n) how the errors change with T.
         stiffness_T: Second derivative of the cost's own term in T.
@@ -152,7 +164,13 @@ def interior_point(
         least = min(least, g[i])
     floor = max(-least, 1e-2)
     s, lam, ds, dlam, dg, omega, target = (
-        np.empty(m), np.empty(m), np.zeros(m), np.zeros(m), np.zeros(m), np.empty(m), np.empty(m)
+        np.empty(m),
+        np.empty(m),
+        np.zeros(m),
+        np.zeros(m),
+        np.zeros(m),
+        np.empty(m),
+        np.empty(m),
     )
     mu = 0.1 * unit / max(used, 1)
     for i in range(used):
@@ -163,12 +181,8 @@ def interior_point(
     dz = np.empty_like(z)
     k_first, k_last = (0, K) if ends_cost else (1, K - 1)
     dual[:] = 0.0
-    corner = stiffness_T
-    for kind in range(3):
-        for k in range(k_first, k_last):
-            for j in range(n):
-                dual[kind, k, j] = weights[kind, j] * by_T[kind, k, j]
-                corner += dual[kind, k, j] * by_T[kind, k, j]
+    weigh(by_T, weights, node_weights, k_first, k_last, dual)
+    corner = stiffness_T + product(dual, by_T)
     pull_back(first, taps, dual, column)
     base_column = column.copy()
     outcome = ITERATION_LIMIT
@@ -176,13 +190,8 @@ def interior_point(
     for iteration in range(max_iterations + 1):
         iterations = iteration
         # Gradient of the cost.
-        g_T = gradient_T
-        for kind in range(3):
-            for k in range(k_first, k_last):
-                for j in range(n):
-                    value = weights[kind, j] * error[kind, k, j]
-                    dual[kind, k, j] = value
-                    g_T += value * by_T[kind, k, j]
+        weigh(error, weights, node_weights, k_first, k_last, dual)
+        g_T = gradient_T + product(dual, by_T)
         pull_back(first, taps, dual, gradient)
         # Residuals.
         mean, primal = 0.0, 0.0
@@ -308,8 +317,19 @@ def interior_point(
 
 @njit(cache=True, error_model="numpy")
 def _scatter(
-    y: Array, factor: float, rows: int, used: int, kinds: Array, nodes: Array, joints: Array, signs: Array, scales: Array,
-    cs: Array, first: Array, taps: Array, out: Array,
+    y: Array,
+    factor: float,
+    rows: int,
+    used: int,
+    kinds: Array,
+    nodes: Array,
+    joints: Array,
+    signs: Array,
+    scales: Array,
+    cs: Array,
+    first: Array,
+    taps: Array,
+    out: Array,
 ) -> float:
     """Add factor · Gᵀ y to out (N−1, n); return the part of T."""
     by_T = 0.0

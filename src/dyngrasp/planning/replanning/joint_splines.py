@@ -146,6 +146,27 @@ def push_forward(first: Array, taps: Array, dx: Array, z: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def weigh(z: Array, weights: Array, node_weights: Array, k_first: int, k_last: int, dual: Array) -> None:
+    """Write Q z into `dual` (3, N+1, n) at the grid points k_first … k_last − 1; weights as in `tracking_kernel.solve`."""
+    for k in range(k_first, k_last):
+        for j in range(z.shape[2]):
+            dual[0, k, j] = (weights[0, j] + node_weights[k]) * z[0, k, j]
+            dual[1, k, j] = weights[1, j] * z[1, k, j]
+            dual[2, k, j] = weights[2, j] * z[2, k, j]
+
+
+@njit(cache=True, error_model="numpy")
+def product(a: Array, b: Array) -> float:
+    """Σ a · b over two arrays (3, N+1, n)."""
+    total = 0.0
+    for kind in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            for j in range(a.shape[2]):
+                total += a[kind, k, j] * b[kind, k, j]
+    return total
+
+
+@njit(cache=True, error_model="numpy")
 def factorise(band: Array) -> None:
     """Replace bands (N−1, 3, n) of n pentadiagonal matrices by L and D⁻¹ of L D Lᵀ; joints lie side by side."""
     size, _, n = band.shape

@@ -7,13 +7,16 @@ from numba import njit
 
 from dyngrasp.planning.replanning.box_rows import INFEASIBLE, OPTIMAL, UNBOUNDED, collect, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
+    TAPS,
     factorise,
     filtered,
     pull_back,
     push_forward,
     sequence,
+    product,
     sequence_by_duration,
     substitute,
+    weigh,
 )
 from dyngrasp.signals import Array
 
@@ -31,6 +34,7 @@ def solve(
     ends: Array,
     held: tuple[bool, bool],
     weights: Array,
+    node_weights: Array,
     duration_weight: float,
     ends_cost: bool,
     boxes: Array,
@@ -52,6 +56,7 @@ def solve(
         ends: (2, 3, n) position, velocity, acceleration at both ends.
         held: Whether the acceleration is given at the start and at the end.
         weights: (3, n) Q_q, Q_q̇, Q_v.
+        node_weights: (K,) added to Q_q at each grid point.
         duration_weight: Q_ΔT of one grid point.
         ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
         boxes: (4, n) q_min, q_max, q̇_max, v_max.
@@ -85,6 +90,13 @@ def solve(
                 base[i, d, j] = (
                     scaled[0, j] * bands[0, i, d] + scaled[1, j] * bands[1, i, d] + scaled[2, j] * bands[2, i, d]
                 )
+    for k in range(k_first, k_last):
+        if node_weights[k] > 0.0:
+            for b in range(TAPS):
+                for d in range(TAPS - b):
+                    value = node_weights[k] * taps[k, b, 0] * taps[k, b + d, 0]
+                    for j in range(n):
+                        base[first[k] + b, d, j] += value
     for end in range(2):
         if held[end]:
             base[0 if end == 0 else size - 1, 0, :] = 1.0
@@ -125,20 +137,13 @@ def solve(
                 error[0, k, j] = z[0, k, j] - reference[0, k, j]
                 error[1, k, j] = z[1, k, j] - T_ref * reference[1, k, j] - w_by_T * shift
                 error[2, k, j] = z[2, k, j] - T_ref * T_ref * reference[2, k, j] - a_by_T * shift
-        for kind in range(3):
-            for k in range(k_first, k_last):
-                for j in range(n):
-                    value = scaled[kind, j] * by_T[kind, k, j]
-                    corner += value * by_T[kind, k, j]
-                    g_T += value * error[kind, k, j]
-                    dual[kind, k, j] = scaled[kind, j] * error[kind, k, j]
+        weigh(error, scaled, node_weights, k_first, k_last, dual)
+        g_T += product(dual, by_T)
         pull_back(first, taps, dual, gradient)
         dT = 0.0
         if free_T:
-            for kind in range(3):
-                for k in range(k_first, k_last):
-                    for j in range(n):
-                        dual[kind, k, j] = scaled[kind, j] * by_T[kind, k, j]
+            weigh(by_T, scaled, node_weights, k_first, k_last, dual)
+            corner += product(dual, by_T)
             pull_back(first, taps, dual, column)
             solved[:] = column
             substitute(band, solved)
@@ -180,11 +185,8 @@ def solve(
     iterations, outcome = 0, OPTIMAL
     duration_ok = not free_T or (duration[0] <= T <= duration[1])
     if least < -VIOLATION or not duration_ok:
-        cost = 0.5 * stiffness_T * (T - T_ref) ** 2
-        for kind in range(3):
-            for k in range(k_first, k_last):
-                for j in range(n):
-                    cost += 0.5 * scaled[kind, j] * error[kind, k, j] ** 2
+        weigh(error, scaled, node_weights, k_first, k_last, dual)
+        cost = 0.5 * (stiffness_T * (T - T_ref) ** 2 + product(dual, error))
         # The cost of moving by what is violated is the scale of a program whose free optimum costs next to nothing.
         outside = max(-least, 0.0)
         if free_T:
@@ -201,6 +203,7 @@ def solve(
                 taps,
                 base,
                 scaled,
+                node_weights,
                 slope,
                 by_T,
                 stiffness_T,

@@ -64,6 +64,7 @@ class TrackingProblem:
         weights: Of the deviations.
         paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the answer then is the linear model of the
             motion, with a trajectory that has the defect of eq. (15).
+        node_weights: (N+1,) added to Q_q at each grid point, where the motion has to stay with the reference; none if left out.
     """
 
     reference: Trajectory
@@ -79,6 +80,7 @@ class TrackingProblem:
     max_duration: float
     weights: TrackingWeights = field(default_factory=TrackingWeights)
     paper_rows: bool = False
+    node_weights: Array | None = None
 
     def __post_init__(self) -> None:
         n = self.reference.position.shape[1]
@@ -169,6 +171,7 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 40) -> Tracki
         ends,
         held,
         weights,
+        np.zeros(N + 1) if problem.node_weights is None else problem.node_weights,
         w.duration,
         not problem.paper_rows,
         boxes,

@@ -1,0 +1,107 @@
+"""Where the funnel is narrow the hand repeats its old motion relative to the part.
+
+The quadratic program knows nothing of the funnel. But the old motion came down inside the old funnel, and carried along rigidly with the
+part it comes down inside the new one. So below the height z_th, where the funnel's wall begins, the reference of the
+program is the carried motion and its positions have weight; above, the correction is free to spread. Eq. (13) has weights Q_k that may
+differ from grid point to grid point.
+
+The carried motion is solved for at a few grid points by inverse kinematics of the same branch and arm angle; between them its difference
+to the old motion is a polynomial.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dyngrasp.errors import OutOfReach
+from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.planning.replanning.target_update import target_updater
+from dyngrasp.signals import Array
+from dyngrasp.trajectory import Trajectory
+
+_KNOTS = 4
+
+
+@dataclass(frozen=True)
+class DescentSettings:
+    """How the descent through the funnel is tracked.
+
+    Attributes:
+        height: The descent begins where G is at this multiple of z_th above the grasp frame.
+        earliest: Part of the rest of the approach that is left free at least: a correction needs its time.
+        stiffness: Rate of the tracking, in multiples of one over the time of the descent: Q_q = (stiffness / time)⁴ Q_v.
+    """
+
+    height: float = 1.05
+    earliest: float = 0.35
+    stiffness: float = 20.0
+
+
+def carried_descent(
+    reference: Trajectory, q_pregrasp: Array, p_flange_grasp: Array, task: GraspTask, settings: DescentSettings
+) -> tuple[Trajectory, Array] | None:
+    """The reference with its descent carried along with the part, and the weights of its positions.
+
+    Args:
+        reference: What is left of the approach.
+        q_pregrasp: (n,) the new pre-grasp (rad).
+        p_flange_grasp: (3,) G of the open hand in the flange frame (m).
+        task: Arm, gripper, part.
+        settings: How.
+
+    Returns:
+        Reference and weights (N+1,) in units of Q_v (1/s⁴); None if the arm cannot follow the carried motion.
+    """
+    robot, updater = task.robot, target_updater(task)
+    N = reference.intervals
+    old_end = robot.forward_kinematics(reference.position[-1])
+    shift = robot.forward_kinematics(q_pregrasp) * old_end.inverse()
+    axis = old_end.rotation @ updater.approach_axis_in_flange
+    lowest = float(axis @ old_end.act(p_flange_grasp)) - task.settings.pregrasp_distance
+    top = lowest + settings.height * task.grasp_object.funnel.z_threshold
+
+    def height(k: int) -> float:
+        return float(axis @ robot.forward_kinematics(reference.position[k]).act(p_flange_grasp))
+
+    above, below = 0, N
+    if height(0) <= top:
+        below = 0
+    while below - above > 1:
+        middle = (above + below) // 2
+        above, below = (middle, below) if height(middle) > top else (above, middle)
+    entry = min(max(below, round(settings.earliest * N)), N - _KNOTS)
+    knots = np.unique(np.linspace(entry, N, _KNOTS).round().astype(int))
+    try:
+        carried = [
+            updater.posture(shift * robot.forward_kinematics(reference.position[k]), reference.position[k])
+            for k in knots[:-1]
+        ]
+    except OutOfReach:
+        return None
+    difference = np.vstack([*carried, q_pregrasp]) - reference.position[knots]
+    s = np.arange(entry, N + 1) / N
+    position, velocity, acceleration = (
+        array.copy() for array in (reference.position, reference.velocity, reference.acceleration)
+    )
+    basis, rate, curvature = _lagrange(knots / N, s)
+    T = reference.duration
+    position[entry:] += basis @ difference
+    velocity[entry:] += rate @ difference / T
+    acceleration[entry:] += curvature @ difference / T**2
+    weights = np.zeros(N + 1)
+    weights[entry:] = (settings.stiffness / ((1 - entry / N) * T)) ** 4
+    return Trajectory(T, position, velocity, acceleration), weights
+
+
+def _lagrange(knots: Array, s: Array) -> tuple[Array, Array, Array]:
+    """Values, first and second derivatives (M, K) of the Lagrange polynomials of K knots at s (M,)."""
+    # About their middle, for powers of numbers near one are nearly alike.
+    middle = knots.mean()
+    inverse = np.linalg.inv(np.vander(knots - middle, increasing=True))
+    powers = np.vander(s - middle, len(knots), increasing=True)
+    order = np.arange(1, len(knots))
+    first = powers[:, :-1] * order
+    second = first[:, :-1] * order[:-1]
+    return powers @ inverse, first @ inverse[1:], second @ inverse[2:]

@@ -1,0 +1,451 @@
+"""The online replanner: from a running plan and new targets to a new plan, audited and in time, or to the old one with a reason."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+
+from dyngrasp.errors import DyngraspError, InvalidProblem, OutOfReach, PlanningFailed
+from dyngrasp.planning.audit import audit
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, moved
+from dyngrasp.planning.problem import AuditReport, PhaseProblem, PhaseSolver, PlanResult, Status
+from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, funnel_recovery
+from dyngrasp.planning.replanning.splice import (
+    APPROACH,
+    DELIVER,
+    GRASP,
+    Candidate,
+    TrackingSettings,
+    hold_start,
+    splice_time,
+    track,
+)
+from dyngrasp.planning.replanning.target_update import target_updater
+from dyngrasp.signals import Array, JointState, PoseEstimate
+from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
+
+
+class Path(StrEnum):
+    """Which way led to the answer."""
+
+    TRACKING = "tracking"
+    REOPTIMISED = "reoptimised"
+    FRESH = "fresh"
+    KEPT = "kept"
+
+
+class PhasePlanner(Protocol):
+    """What plans whole phases under all constraints; the replanner falls back on it."""
+
+    def phase_problems(
+        self, q_start: JointState, targets: GraspTargets, gripper_start: Array | None = None
+    ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
+        """The problems of the three phases from a moving start."""
+        ...
+
+    def plan(
+        self, q_start: JointState, targets: GraspTargets, gripper_start: Array | None = None, start_time: float = 0.0
+    ) -> PlanResult:
+        """A whole plan from a moving start."""
+        ...
+
+
+@dataclass(frozen=True)
+class ReplannerSettings:
+    """Settings of `Replanner`.
+
+    Attributes:
+        budget: Time from the call to the splice (s). What takes longer is discarded.
+        fresh_budget: The same for a fresh plan (s), which the old plan bridges.
+        tracking: Of the quadratic program.
+        least_horizon: Shorter rests of a phase are not touched (s): nothing could be corrected in them but violently.
+        finger_clearance: Grasp updates end when the closing gap is within twice this of the part's width (m): from then on
+            the fingers meet the part, which moves with them and not with its estimate.
+        recovery_time, recovery_share: τ of `funnel_recovery`.
+        settled: A moving part's grasp time is iterated until the predicted part moves less than this (m).
+        gate: Whether the audit decides on publication. It does, but where the paper's own method is to be shown as it is.
+    """
+
+    budget: float = 0.020
+    fresh_budget: float = 0.100
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    least_horizon: float = 0.06
+    finger_clearance: float = 0.004
+    recovery_time: float = 0.5
+    recovery_share: float = 0.6
+    settled: float = 1e-7
+    gate: bool = True
+
+    def __post_init__(self) -> None:
+        if not (0 < self.budget <= self.fresh_budget and self.least_horizon > 0):
+            raise InvalidProblem(f"0 < budget ≤ fresh_budget and least_horizon > 0 expected, got {self}")
+
+
+@dataclass(frozen=True)
+class ReplanResult:
+    """Answer to one call.
+
+    Attributes:
+        status: `converged` if there is a new plan; why not otherwise.
+        plan: The plan to follow: the new one, or the old one that goes on.
+        path: Which way led to it.
+        splice: When a new plan takes over (s).
+        targets: What the new plan was made for.
+        audit: Of the new plan, or of the candidate that failed; None if none was audited.
+        recovery: φ_0 of the funnel, 1 where nothing was softened.
+        timings_ms: Wall time of each stage (ms): "targets", "tracking", "audit", "reoptimise", "fresh", "total".
+        message: Why the old plan was kept, or why the first ways failed.
+        iterations: Of the tracking program's interior point method; 0 where no box was active.
+    """
+
+    status: Status
+    plan: GraspPlan
+    path: Path
+    splice: float
+    targets: GraspTargets
+    audit: AuditReport | None
+    recovery: float
+    timings_ms: dict[str, float]
+    message: str = ""
+    iterations: int = 0
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a new plan."""
+        return self.status is Status.CONVERGED
+
+    def require(self) -> GraspPlan:
+        """The new plan, or `PlanningFailed` with this result attached."""
+        if not self.ok:
+            raise PlanningFailed(f"{self.status}: {self.message}", self)
+        return self.plan
+
+
+class Replanner:
+    """Replaces running plans; keeps no state between calls but what it has computed of the task."""
+
+    def __init__(
+        self,
+        task: GraspTask,
+        settings: ReplannerSettings | None = None,
+        solver: PhaseSolver | None = None,
+        planner: PhasePlanner | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Prepare a replanner.
+
+        Args:
+            task: Arm, gripper, part and target.
+            settings: Budget and weights.
+            solver: Solves a phase under all constraints where the audit refuses the quadratic program's answer.
+            planner: Makes the problems for it, and fresh plans where the part moved too far.
+            clock: Seconds; what the deadline is measured with. A constant makes results independent of the machine.
+        """
+        self.task = task
+        self.settings = settings or ReplannerSettings()
+        self.solver, self.planner = solver, planner
+        self._clock = clock
+
+    def replan(self, plan: GraspPlan, targets: GraspTargets, t: float) -> ReplanResult:
+        """Continue `plan` to new targets.
+
+        Args:
+            plan: The running plan, whoever made it.
+            targets: New boundary states, best from `updated_targets`: those continue the plan's posture.
+            t: Now (s), on the plan's clock.
+
+        Returns:
+            A new plan that takes over at t + budget, with q, q̇ and q̈ of the old one there; or the old plan with a status.
+        """
+        return _Attempt(self, plan, t).towards(targets)
+
+    def replan_to_pose(self, plan: GraspPlan, previous: GraspTargets, estimate: PoseEstimate, t: float) -> ReplanResult:
+        """The whole cycle: from an estimate of the part's pose through the inverse kinematics to an audited plan.
+
+        A moving part is predicted to the time of the grasp. That time changes with the plan, so both are iterated until the
+        predicted part no longer moves.
+
+        Args:
+            plan: The running plan.
+            previous: What it was made for.
+            estimate: Newest estimate; its capture time is what prediction starts from.
+            t: Now (s).
+        """
+        return _Attempt(self, plan, t).to_pose(previous, estimate)
+
+
+class _Attempt:
+    """One call: what is known, and the clock that runs."""
+
+    def __init__(self, replanner: Replanner, plan: GraspPlan, t: float) -> None:
+        self.task, self.settings = replanner.task, replanner.settings
+        self.solver, self.planner = replanner.solver, replanner.planner
+        self.plan, self.t = plan, t
+        self.clock = replanner._clock
+        self.began = self.clock()
+        self.timings: dict[str, float] = {}
+        self.report: AuditReport | None = None
+        self.recovery: FunnelRecovery | None = None
+        self.reasons: list[str] = []
+        self.iterations = 0
+        self.splice = splice_time(plan, t + self.settings.budget)
+
+    def to_pose(self, previous: GraspTargets, estimate: PoseEstimate) -> ReplanResult:
+        refusal = self._refusal()
+        if refusal:
+            return self._kept(Status.INFEASIBLE, previous, refusal)
+        updater, twist = target_updater(self.task), estimate.twist_world
+        plan, targets = self.plan, previous
+        # A slower part than this moves less than `settled` while the grasp time changes by a second.
+        moving = bool(np.abs(twist).max() > self.settings.settled)
+        grasp_time = float(plan.phase_ends[GRASP])
+        for _ in range(8 if moving else 1):
+            started = self.clock()
+            T = estimate.T_world_object
+            if moving:
+                T = moved(T, twist, grasp_time - estimate.t_capture)
+            try:
+                targets = updater.update(
+                    previous, T, twist if moving else None, grasp_time, float(plan.durations[GRASP])
+                )
+            except OutOfReach as error:
+                self._count("targets", started)
+                return self._fresh_or_kept(previous, estimate, f"inverse kinematics: {error}")
+            self._count("targets", started)
+            if not moving:
+                break
+            candidate = self._track(targets)
+            if candidate.plan is None:
+                break
+            change = float(candidate.plan.phase_ends[GRASP]) - grasp_time
+            grasp_time, plan = grasp_time + change, candidate.plan
+            if abs(change) * float(np.abs(twist).max()) <= self.settings.settled:
+                break
+        return self.towards(targets, estimate)
+
+    def towards(self, targets: GraspTargets, estimate: PoseEstimate | None = None) -> ReplanResult:
+        refusal = self._refusal()
+        if refusal:
+            return self._kept(Status.INFEASIBLE, targets, refusal)
+        phase = self.plan.phase_at(self.splice)
+        if phase == APPROACH:
+            settings = self.settings
+            self.recovery = funnel_recovery(
+                self.plan, targets, self.task, self.splice, settings.recovery_time, settings.recovery_share
+            )
+            if self.recovery is None:
+                return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
+        candidate = self._track(targets)
+        self.iterations = candidate.iterations
+        status = candidate.status
+        if candidate.plan is None:
+            self.reasons.append(f"tracking: {candidate.message}")
+        else:
+            self.report = self._audited(candidate.plan, targets)
+            if self.report.ok or not self.settings.gate:
+                return self._published(candidate.plan, targets, Path.TRACKING, self.settings.budget)
+            status = Status.AUDIT_FAILED
+            self.reasons.append(f"tracking: {_failures(self.report)}")
+            if self._late(self.settings.budget):
+                return self._kept(Status.DEADLINE_MISSED, targets, "no time for the full problem")
+            if self.solver is not None and self.planner is not None and phase == APPROACH:
+                found = self._reoptimised(candidate.plan, targets)
+                if found is not None:
+                    return self._published(found, targets, Path.REOPTIMISED, self.settings.budget)
+        return self._fresh_or_kept(targets, estimate, "", status)
+
+    def _refusal(self) -> str:
+        """Why nothing may change any more; "" if it may."""
+        plan, task = self.plan, self.task
+        if self.splice < plan.start_time:
+            return "the running plan has not taken over yet"
+        phase = plan.phase_at(self.splice)
+        if phase == DELIVER:
+            return "the part is in the hand"
+        left = float(plan.phase_ends[phase]) - self.splice
+        if left < self.settings.least_horizon:
+            return f"{left:.3f} s are left of the phase {PHASE_NAMES[phase]}"
+        if phase == GRASP:
+            closed = plan.gripper[GRASP].position[-1]
+            gap = task.gripper.aperture(plan.sample(self.splice).gripper.position) - task.gripper.aperture(closed)
+            if gap < 2 * self.settings.finger_clearance:
+                return "the fingers close on the part"
+        return ""
+
+    def _track(self, targets: GraspTargets) -> Candidate:
+        started = self.clock()
+        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking)
+        self._count("tracking", started)
+        return candidate
+
+    def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
+        started = self.clock()
+        report = audit(plan, targets, self.task)
+        if self.recovery is not None and plan.start_time == self.splice:
+            report = self.recovery.judge(report, plan, targets, self.task)
+        self._count("audit", started)
+        return report
+
+    def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> GraspPlan | None:
+        """Solve the phases that the audit refuses under all constraints, from the candidate; None if that does not help."""
+        assert self.planner is not None
+        assert self.solver is not None
+        assert self.report is not None
+        started = self.clock()
+        state = self.plan.sample(self.splice)
+        try:
+            problems = self.planner.phase_problems(state.arm, targets, state.gripper.position)
+        except DyngraspError as error:
+            self.reasons.append(f"full problem: {error}")
+            self._count("reoptimise", started)
+            return None
+        solved: set[int] = set()
+        plan, report = candidate, self.report
+        while not self._late(self.settings.budget):
+            refused = {int(candidate.phase_at(min(e.time, plan.end_time))) for e in report.failures} - solved
+            if not refused:
+                break
+            for phase in sorted(refused):
+                problem = self._softened(problems[phase], plan) if phase == APPROACH else problems[phase]
+                solution = self.solver.solve(problem, plan.arm[phase])
+                if not solution.ok:
+                    self.reasons.append(f"full problem: {solution.message}")
+                    self._count("reoptimise", started)
+                    return None
+                motion = solution.require()
+                if phase == APPROACH:
+                    held = hold_start(motion, state.arm, targets.pregrasp, self.task, self.settings.tracking)
+                    if held is None:
+                        self.reasons.append("full problem: the acceleration at the splice cannot be met")
+                        self._count("reoptimise", started)
+                        return None
+                    motion = held
+                plan = _with_phase(plan, phase, motion)
+                solved.add(phase)
+            self._count("reoptimise", started)
+            report = self._audited(plan, targets)
+            started = self.clock()
+            if report.ok:
+                self.report = report
+                return plan
+        self._count("reoptimise", started)
+        self.report = report
+        self.reasons.append(f"full problem: {_failures(report)}" if not report.ok else "full problem: out of time")
+        return None
+
+    def _softened(self, problem: PhaseProblem, plan: GraspPlan) -> PhaseProblem:
+        recovery = self.recovery
+        if recovery is None or recovery.factor >= 1.0:
+            return problem
+        rows = tuple(
+            recovery.soften(row, plan.durations[APPROACH]) if row.name == "funnel" else row
+            for row in problem.constraints
+        )
+        return replace(problem, constraints=rows)
+
+    def _fresh_or_kept(
+        self, targets: GraspTargets, estimate: PoseEstimate | None, reason: str, status: Status = Status.INFEASIBLE
+    ) -> ReplanResult:
+        if reason:
+            self.reasons.append(reason)
+        settings, plan = self.settings, self.plan
+        splice = splice_time(plan, self.t + settings.fresh_budget)
+        left = float(plan.phase_ends[APPROACH]) - splice
+        if self.planner is None or left < settings.least_horizon or self._late(settings.fresh_budget):
+            return self._kept(status, targets, "")
+        started = self.clock()
+        state = plan.sample(splice)
+        if state.gripper.velocity.any():
+            return self._kept(status, targets, "a fresh plan needs the hand at rest")
+        T = targets.T_world_object
+        if estimate is not None and not estimate.twist_world.any():
+            T = estimate.T_world_object
+        try:
+            from_here = self._fresh_targets(T, state.arm.position, targets)
+            result = self.planner.plan(state.arm, from_here, state.gripper.position, splice)
+        except DyngraspError as error:
+            self._count("fresh", started)
+            return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
+        self._count("fresh", started)
+        if not result.ok or result.plan is None:
+            return self._kept(result.status, targets, f"fresh plan: {result.message}")
+        held = hold_start(result.plan.arm[APPROACH], state.arm, from_here.pregrasp, self.task, settings.tracking)
+        if held is None:
+            return self._kept(Status.INFEASIBLE, targets, "fresh plan: the acceleration at the splice cannot be met")
+        self.splice, self.recovery = splice, None
+        fresh = _with_phase(result.plan, APPROACH, held)
+        self.report = self._audited(fresh, from_here)
+        if not self.report.ok:
+            return self._kept(Status.AUDIT_FAILED, targets, f"fresh plan: {_failures(self.report)}")
+        return self._published(fresh, from_here, Path.FRESH, settings.fresh_budget)
+
+    def _fresh_targets(self, T_world_object, q: Array, targets: GraspTargets) -> GraspTargets:
+        from dyngrasp.planning.grasp_targets import grasp_targets
+
+        if targets.moving:
+            return targets
+        return grasp_targets(T_world_object, self.task, q)
+
+    def _late(self, budget: float) -> bool:
+        return self.clock() - self.began > budget
+
+    def _count(self, stage: str, started: float) -> None:
+        self.timings[stage] = self.timings.get(stage, 0.0) + 1e3 * (self.clock() - started)
+
+    def _published(self, plan: GraspPlan, targets: GraspTargets, path: Path, budget: float) -> ReplanResult:
+        """The last look at the clock comes after everything else: what is late is not published."""
+        factor = self.recovery.factor if self.recovery is not None else 1.0
+        elapsed = self.clock() - self.began
+        self.timings["total"] = 1e3 * elapsed
+        if elapsed > budget:
+            return self._kept(Status.DEADLINE_MISSED, targets, f"{1e3 * elapsed:.1f} ms of {1e3 * budget:.0f} ms taken")
+        message = "; ".join(self.reasons)
+        return ReplanResult(
+            Status.CONVERGED,
+            plan,
+            path,
+            self.splice,
+            targets,
+            self.report,
+            factor,
+            self.timings,
+            message,
+            self.iterations,
+        )
+
+    def _kept(self, status: Status, targets: GraspTargets, reason: str) -> ReplanResult:
+        if reason:
+            self.reasons.append(reason)
+        self.timings["total"] = 1e3 * (self.clock() - self.began)
+        factor = self.recovery.factor if self.recovery is not None else 1.0
+        message = "; ".join(self.reasons)
+        return ReplanResult(
+            status,
+            self.plan,
+            Path.KEPT,
+            self.splice,
+            targets,
+            self.report,
+            factor,
+            self.timings,
+            message,
+            self.iterations,
+        )
+
+
+def _with_phase(plan: GraspPlan, phase: int, motion: Trajectory) -> GraspPlan:
+    """The plan with one phase of the arm replaced, the hand's path stretched to its duration."""
+    from dyngrasp.planning.replanning.splice import stretched
+
+    arm, hand = list(plan.arm), list(plan.gripper)
+    arm[phase], hand[phase] = motion, stretched(hand[phase], motion.duration)
+    return replace(plan, arm=tuple(arm), gripper=tuple(hand))
+
+
+def _failures(report: AuditReport) -> str:
+    return "audit: " + "; ".join(str(entry) for entry in report.failures)
