@@ -7,11 +7,8 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.metadata import version
 
-from dyngrasp.cli.arguments import argument_parser
-
-DELIVERED, NOT_DELIVERED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+from dyngrasp.cli.arguments import BAD_INPUT, DELIVERED, INTERRUPTED, argument_parser
 
 # A command is looked up here and imported when it is called, so that `--help` does not wait for the solvers.
 COMMANDS = {
@@ -32,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 done and good, 1 done and not good, 2 bad input, 130 interrupted.
     """
-    options = argument_parser(version("dyngrasp")).parse_args(arguments)
+    options = argument_parser(_version()).parse_args(arguments)
     _quiet_threads()
     module, function = COMMANDS[options.command]
     try:
@@ -54,6 +51,12 @@ def _guarded(command: Callable[[argparse.Namespace], int], options: argparse.Nam
     except DyngraspError as error:
         print(f"dyngrasp: error: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
+
+
+def _version() -> str:
+    from dyngrasp import __version__
+
+    return __version__
 
 
 def _quiet_threads() -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+DELIVERED, NOT_DELIVERED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+"""Exit statuses: done and good, done and not good, bad input or usage, interrupted."""
+
 _SCENARIO = "a scenario file (TOML)"
 _SEED = "draws where the part lies and how the plant deviates; default: the scenario's own seed"
 _SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"

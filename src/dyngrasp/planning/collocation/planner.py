@@ -279,9 +279,13 @@ class CollocationPlanner:
 
     def _above_ground(self, targets: GraspTargets) -> NodeConstraint:
         T, corners = self._T_flange_object(targets), self.task.grasp_object.underside
-        return constraints.above_ground(
+        standing = corners @ targets.T_world_object.rotation.T + targets.T_world_object.translation
+        # An estimate may put a standing part a little into the ground: then it need not rise faster than it can.
+        sunk = np.maximum(0.0, -standing[:, 2])
+        rows = constraints.above_ground(
             self.task.robot, corners @ T.rotation.T + T.translation, self.settings.intervals
         )
+        return replace(rows, lower=rows.lower - sunk)
 
     def _T_flange_object(self, targets: GraspTargets) -> pin.SE3:
         """The part in the flange frame as the closed hand holds it."""

@@ -1,0 +1,164 @@
+"""`dyngrasp run` and `dyngrasp plan`: one trial, in physics or on paper."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from dyngrasp.cli.arguments import DELIVERED, NOT_DELIVERED
+from dyngrasp.errors import RenderingUnavailable
+from dyngrasp.experiments.draws import Trial, draw_trial
+from dyngrasp.experiments.output import OutputFolder, atomic, check_writable, write_json
+from dyngrasp.experiments.scenario import load_scenario
+from dyngrasp.experiments.trial import ExecutedTrial, PlannedTrial, execute_trial, plan_trial, planner_for, summary
+from dyngrasp.experiments.workcell import Workcell, load_workcell
+from dyngrasp.report.summary import run_table
+
+
+def run(options: argparse.Namespace) -> int:
+    """Plan, carry out, judge, and write what happened."""
+    console = Console()
+    workcell, trial = _prepare(options)
+    folder = options.out or Path("out") / workcell.scenario.name
+    with OutputFolder(folder) as out:
+        _announce(console, workcell, trial)
+        planned = _plan(console, workcell, trial)
+        executed = None
+        if planned.result.ok:
+            plan = planned.result.require()
+            with _bar(console, "physics", plan.end_time) as advance:
+                executed = execute_trial(workcell, trial, planned, lambda t, phase: advance(t, f"physics: {phase}"))
+        document = summary(trial, planned, executed)
+        _write(console, workcell, planned, executed, document, out, options.video)
+        console.print()
+        console.print(run_table(document))
+        console.print()
+        if document["success"]:
+            console.print(f"[bold green]delivered[/]; results in {escape(str(folder))}")
+            return DELIVERED
+        console.print(f"[bold red]not delivered[/]: {escape(document['cause'])}; results in {escape(str(folder))}")
+        return NOT_DELIVERED
+
+
+def plan(options: argparse.Namespace) -> int:
+    """Plan only and write the plan."""
+    console = Console()
+    workcell, trial = _prepare(options)
+    check_writable(options.out)
+    _announce(console, workcell, trial)
+    planned = _plan(console, workcell, trial)
+    if not planned.result.ok:
+        console.print(f"[bold red]no valid plan[/]: {escape(planned.result.message)}")
+        return NOT_DELIVERED
+    with atomic(options.out) as temporary:
+        planned.result.require().save(temporary)
+    console.print(run_table(summary(trial, planned, None)))
+    console.print(f"plan in {escape(str(options.out))}")
+    return DELIVERED
+
+
+def _prepare(options: argparse.Namespace) -> tuple[Workcell, Trial]:
+    scenario = load_scenario(options.scenario, options.overrides)
+    workcell = load_workcell(scenario, options.scenario)
+    return workcell, draw_trial(workcell, scenario.seed if options.seed is None else options.seed)
+
+
+def _announce(console: Console, workcell: Workcell, trial: Trial) -> None:
+    scenario, task, T = workcell.scenario, workcell.task, trial.T_world_object
+    yaw = np.rad2deg(np.arctan2(T.rotation[1, 0], T.rotation[0, 0]))
+    console.print(
+        f"[bold]{escape(scenario.name)}[/]: {task.robot.name} with {task.gripper.name} takes {task.grasp_object.name}"
+    )
+    x, y, _ = T.translation
+    console.print(f"part at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.0f}°; seed {trial.seed}")
+
+
+def _plan(console: Console, workcell: Workcell, trial: Trial) -> PlannedTrial:
+    planner = planner_for(workcell)
+    with console.status("planning"):
+        planned = plan_trial(workcell, trial, planner)
+    if planned.result.ok:
+        console.print(f"planned in {planned.planning_ms:.0f} ms; every constraint of the audit holds")
+    return planned
+
+
+def _write(
+    console: Console,
+    workcell: Workcell,
+    planned: PlannedTrial,
+    executed: ExecutedTrial | None,
+    document: dict,
+    out: OutputFolder,
+    video: bool,
+) -> None:
+    write_json(out / "summary.json", document)
+    if planned.result.plan is not None:
+        with atomic(out / "plan.json") as temporary:
+            planned.result.plan.save(temporary)
+    if executed is None:
+        return
+    with atomic(out / "record.npz") as temporary:
+        executed.record.save(temporary)
+    _figure(workcell, planned, executed, document, out)
+    if video and workcell.scenario.render.video:
+        _video(console, workcell, executed, out)
+
+
+def _figure(
+    workcell: Workcell, planned: PlannedTrial, executed: ExecutedTrial, document: dict, out: OutputFolder
+) -> None:
+    from dyngrasp.report.episode_figures import episode_figure
+    from dyngrasp.report.figures import save_figure
+
+    verdict = "delivered" if document["success"] else "not delivered"
+    title = f"{workcell.scenario.name} · seed {document['seed']} · {verdict}"
+    figure = episode_figure(workcell.task, planned.targets, planned.result.require(), executed.record, title)
+    save_figure(figure, out / "trajectory.png")
+
+
+def _video(console: Console, workcell: Workcell, executed: ExecutedTrial, out: OutputFolder) -> None:
+    from dyngrasp.report.video import write_video
+    from dyngrasp.simulation.rendering import Renderer
+
+    render, record = workcell.scenario.render, executed.record
+    times = np.arange(record.t[0], record.t[-1], 1.0 / render.frames_per_second)
+    try:
+        with (
+            Renderer(executed.scene, width=render.width, height=render.height) as renderer,
+            _bar(console, "video", len(times)) as advance,
+        ):
+
+            def frames() -> Iterator[np.ndarray]:
+                for i, t in enumerate(times):
+                    advance(i, "video")
+                    yield renderer.frame(record.scene_state[record.index_at(t)])
+
+            write_video(out / "episode.mp4", frames(), render.frames_per_second)
+    except RenderingUnavailable as error:
+        console.print(f"no video: {escape(str(error))}")
+
+
+@contextmanager
+def _bar(console: Console, label: str, total: float) -> Iterator[Callable[[float, str], None]]:
+    """A progress bar on a terminal, one line for each new label elsewhere."""
+    if not console.is_terminal:
+        seen: set[str] = set()
+
+        def line(_: float, text: str) -> None:
+            if text not in seen:
+                seen.add(text)
+                console.print(text)
+
+        yield line
+        return
+    columns = (TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(label, total=total)
+        yield lambda done, text: bar.update(task, completed=done, description=text)
