@@ -1,8 +1,8 @@
 """Shared libraries compiled once by the machine's C compiler and kept in the user's cache folder.
 
 An entry is named by a hash of everything that its code depends on, and by the digest of its own content: a file that
-was damaged no longer fits its name and is built again. Files appear by renaming, so that two processes may build the same
-entry at once. Nothing is loaded but what this module built, from a folder that only its owner can write to.
+was damaged no longer fits its name and is built again. Files appear by renaming, so that two processes may build the
+same entry at once. Nothing is loaded but what this module built, from a folder that only its owner can write to.
 """
 
 from __future__ import annotations

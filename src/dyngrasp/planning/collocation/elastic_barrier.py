@@ -1,8 +1,8 @@
 """Slacks, elastic variables and multipliers of the rows g ≥ 0: what an interior point iteration does to each row.
 
 Every row may be violated at a price ν (Gould, Orban, Toint 2015, "An interior-point ℓ1-penalty method for nonlinear
-optimization"): g = s − t with s, t > 0, and ν t is added to the objective. The logarithmic barrier of s and t gives, for
-a barrier parameter μ,
+optimization"): g = s − t with s, t > 0, and ν t is added to the objective. The logarithmic barrier of s and t gives,
+for a barrier parameter μ,
 
     s λ = μ,      t (ν − λ) = μ,      s − t = g,
 
@@ -39,6 +39,17 @@ def start(g: Array, mu: float, price: float, least_slack: float, s: Array, t: Ar
             s[i] = least_slack
             t[i] = s[i] - g[i]
         multiplier[i] = min(mu / s[i], price / 2)
+
+
+@njit(cache=True, error_model="numpy")
+def start_near(g: Array, mu: float, price: float, known: Array, s: Array, t: Array, multiplier: Array) -> None:
+    """Slacks and multipliers from multipliers `known` of a problem nearby, with products s λ of at least μ."""
+    for i in range(g.size):
+        value = min(max(known[i], 1e-3 * mu), price / 2)
+        t[i] = mu / price
+        s[i] = max(g[i] + t[i], mu / value)
+        t[i] = s[i] - g[i]
+        multiplier[i] = max(value, min(mu / s[i], price / 2))
 
 
 @njit(cache=True, error_model="numpy")

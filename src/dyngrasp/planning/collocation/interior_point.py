@@ -6,8 +6,8 @@ is fixed until its problem is solved, and Armijo's rule on the barrier merit fun
 raises E it is taken back and the monotone mode goes on, until E has fallen by half (Nocedal, Wächter, Waltz 2009,
 "Adaptive barrier update strategies for nonlinear interior methods"). In monotone mode every step is a descent step of a
 smooth function bounded below, hence the iterates approach its stationary points (Gould, Orban, Toint 2015, for elastic
-rows). Where such a point violates a row, the violation alone is minimised; if it cannot be brought to zero the problem is
-reported as infeasible.
+rows). Where such a point violates a row, the violation alone is minimised; if it cannot be brought to zero the problem
+is reported as infeasible.
 
 The Newton matrix is made positive definite: the banded part by leaving out part of the curvature of the rows until its
 Cholesky factorisation succeeds, then by adding multiples of the second derivative of Σ|a|²; the row of T by replacing a
@@ -20,68 +20,13 @@ step lowers the objective by, plus the duality gap. It has the unit of the objec
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from enum import Enum, auto
 
 import numpy as np
 
 from dyngrasp.planning.collocation import elastic_barrier as rows
+from dyngrasp.planning.collocation.iterates import Best, InteriorPointSettings, Outcome
 from dyngrasp.planning.collocation.phase_model import PhaseModel
 from dyngrasp.signals import Array
-
-
-@dataclass(frozen=True)
-class InteriorPointSettings:
-    """Settings of `InteriorPoint`.
-
-    Attributes:
-        tolerance: E at the solution, relative to the objective.
-        violation_tolerance: Largest violation of a row at the solution, in its scaled unit.
-        max_iterations: Newton systems.
-        initial_barrier: μ at the start, relative to the objective.
-        least_slack: Slack that a violated row begins with.
-        price: ν at the start, relative to the objective.
-    """
-
-    tolerance: float = 1e-9
-    violation_tolerance: float = 1e-9
-    max_iterations: int = 200
-    initial_barrier: float = 1e-3
-    least_slack: float = 1e-2
-    price: float = 3.0
-
-
-class Outcome(Enum):
-    """How an attempt ended."""
-
-    OPTIMAL = auto()
-    INFEASIBLE = auto()
-    ITERATION_LIMIT = auto()
-    STALLED = auto()
-    DEADLINE = auto()
-    NONFINITE = auto()
-
-
-@dataclass
-class Best:
-    """The best iterate so far: the cheapest that violates nothing, else the one that violates least."""
-
-    x: Array
-    T: float
-    objective: float = np.inf
-    violation: float = np.inf
-
-    def offer(self, x: Array, T: float, objective: float, violation: float, tolerance: float) -> None:
-        """Keep an iterate if it is better than the one kept."""
-        if not np.isfinite(objective + violation):
-            return
-        if violation <= tolerance:
-            better = self.violation > tolerance or objective < self.objective
-        else:
-            better = violation < self.violation
-        if better:
-            self.x[:], self.T, self.objective, self.violation = x, T, objective, violation
-
 
 KEEP = 0.995  # a step takes at most this share of a slack or multiplier
 MEMORY = 5  # iterations within which E must fall in free mode
@@ -122,7 +67,7 @@ class InteriorPoint:
         self.T_old = 0.0
 
     def solve(
-        self, model: PhaseModel, x: Array, T: float, deadline: float, multiplier: Array | None = None
+        self, model: PhaseModel, x: Array, T: float, deadline: float, multipliers: Array | None = None
     ) -> tuple[Outcome, Best, int]:
         """Minimise from x (N−1, n) and T.
 
@@ -131,7 +76,7 @@ class InteriorPoint:
             x: Start, unknowns of `ThreeTap`.
             T: Start, duration (s).
             deadline: A value of `time.perf_counter`; the best iterate until then is returned.
-            multiplier: Multipliers of the rows at the solution of a problem nearby, for a warm start.
+            multipliers: Of the rows at the solution of a problem nearby, for a warm start.
 
         Returns:
             How it ended, the best iterate, and the number of Newton systems.
@@ -146,8 +91,10 @@ class InteriorPoint:
         self.unit = max(abs(objective), 1e-3)
         self.price = settings.price * self.unit
         self.best = Best(self.x.copy(), T)
-        self._restart(1.0, multiplier)
-        self.since = 0
+        self._restart(1.0, 0)
+        if multipliers is not None:
+            self.mu = settings.warm_barrier * self.unit
+            rows.start_near(self.g, self.mu, self.price, multipliers, self.s, self.t, self.multiplier)
         for iteration in range(settings.max_iterations + 1):
             objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
             violation = max(0.0, -float(self.g.min()))
@@ -158,8 +105,7 @@ class InteriorPoint:
             if model.factor == 0.0 and feasible:
                 # There is a feasible point after all: the price of a violation had been too low.
                 self.price *= DEARER
-                self._restart(1.0, None)
-                self.since = iteration
+                self._restart(1.0, iteration)
                 objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
             self._raise_price()
             if not self._factorise():
@@ -175,43 +121,45 @@ class InteriorPoint:
                 return Outcome.ITERATION_LIMIT, self.best, iteration
             if time.perf_counter() > deadline:
                 return Outcome.DEADLINE, self.best, iteration
-            stationary = error <= STATIONARY * self.price * violation
-            if violation < PROGRESS * self.least_violation:
-                self.least_violation, self.since = violation, iteration
-            hopeless = iteration - self.since >= PATIENCE
-            if not feasible and (stationary or hopeless):
+            if not feasible and self._violation_stays(violation, error, iteration):
                 if model.factor == 0.0:
                     return Outcome.INFEASIBLE, self.best, iteration
                 # The cheapest point violates a row: is there any that does not?
-                self._restart(0.0, None)
-                self.since = iteration
+                self._restart(0.0, iteration)
                 continue
             if not self._choose_mode(error, mean):
                 self._undo_step()
             elif self.free:
                 self._mehrotra_step(mean)
             elif not self._armijo_step(objective):
-                if feasible and model.factor == 1.0:
+                if feasible:
                     solved = error <= ACCEPTABLE * settings.tolerance * self.unit
                     return Outcome.OPTIMAL if solved else Outcome.STALLED, self.best, iteration
                 if model.factor == 0.0:
                     return Outcome.INFEASIBLE, self.best, iteration
-                self._restart(0.0, None)
+                self._restart(0.0, iteration)
         raise AssertionError("the loop returns in its last round")
 
-    def _restart(self, factor: float, multiplier: Array | None) -> None:
+    def _restart(self, factor: float, iteration: int) -> None:
         """Slacks and multipliers for the present point, in free mode; `factor` weighs the objective."""
         settings = self.settings
         self.model.factor = factor
         self.mu = settings.initial_barrier * self.unit
         self.model.values(self.x, self.T, self.g)
         rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
-        self.free, self.history, self.reference, self.mean = True, [], np.inf, self.mu
+        self.free, self.history, self.reference, self.mean = settings.adaptive, [], np.inf, self.mu
         self.last_shift = 0.0
-        self.least_violation = np.inf
+        self.least_violation, self.since = np.inf, iteration
+
+    def _violation_stays(self, violation: float, error: float, iteration: int) -> bool:
+        """Whether this point is stationary although it violates a row, or the violation has long ceased to fall."""
+        if violation < PROGRESS * self.least_violation:
+            self.least_violation, self.since = violation, iteration
+        never_feasible = self.best.violation > self.settings.violation_tolerance
+        return error <= STATIONARY * self.price * violation or (never_feasible and iteration - self.since >= PATIENCE)
 
     def _raise_price(self) -> None:
-        """Keep ν well above the multipliers: rows are then satisfied with strict inequality, and ν only counts beyond."""
+        """Keep ν well above the multipliers: rows then hold strictly, and ν matters only where they do not."""
         if self.multiplier.max() > CLOSE * self.price and self.price < DEAREST * self.unit:
             self.price *= DEARER
             # Errors measured with the old price are of no use for comparison.
@@ -220,7 +168,7 @@ class InteriorPoint:
     def _choose_mode(self, error: float, mean: float) -> bool:
         """Decide between the modes; False if the last step was a free one that led astray."""
         if not self.free and error <= self.reference:
-            self.free, self.history = True, []
+            self.free, self.history = self.settings.adaptive, []
         if not self.free:
             return True
         if error > FALL * max(self.history[-MEMORY:], default=np.inf):

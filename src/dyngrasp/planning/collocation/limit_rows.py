@@ -42,6 +42,7 @@ class LimitRows:
         free_at_ends: (m,) 1.0 where a row depends on v, so that it is not constant at the ends.
         shortest, longest: Bounds of T (s).
         fixed_duration: Whether they leave T no freedom.
+        names: What each of the R rows of a grid point limits, and at last the duration.
     """
 
     middle: Array
@@ -57,6 +58,7 @@ class LimitRows:
     shortest: float
     longest: float
     fixed_duration: bool
+    names: tuple[str, ...]
 
     @classmethod
     def of(cls, problem: PhaseProblem, functions: list[NodeFunctions]) -> LimitRows:
@@ -71,14 +73,22 @@ class LimitRows:
         upper = np.concatenate([c.upper for c in problem.constraints] or none) / scale
         widening = np.maximum(0.0, NARROWEST - (upper - lower)) / 2
         free = np.concatenate([f.depends_on_acceleration for f in functions] or none)
+        lower_index, upper_index = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
+        of_row = [c.name for c in problem.constraints for _ in range(c.lower.size)]
+        names = (
+            2 * problem.joints * ["position"]
+            + 2 * problem.joints * ["velocity"]
+            + 2 * acceleration.size * ["acceleration"]
+        )
+        names += [of_row[i] for i in (*lower_index, *upper_index)]
         shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
         return cls(
             (q_max + q_min) / 2,
             np.maximum((q_max - q_min) / 2, NARROWEST),
             np.minimum(problem.velocity_limit, UNBOUNDED),
             acceleration,
-            np.flatnonzero(np.isfinite(lower)),
-            np.flatnonzero(np.isfinite(upper)),
+            lower_index,
+            upper_index,
             lower - widening,
             upper + widening,
             1.0 / scale,
@@ -86,6 +96,7 @@ class LimitRows:
             shortest,
             problem.max_duration,
             problem.max_duration - shortest <= NARROWEST * problem.max_duration,
+            (*names, "duration"),
         )
 
     @property
@@ -108,16 +119,11 @@ class LimitRows:
         """
         n, accelerations = self.velocity.size, 2 * self.acceleration.size
         least = g[:-2].reshape(-1, self.rows_per_point).min(axis=0)
-        kinds = {
-            "position": least[: 2 * n],
-            "velocity": least[2 * n : 4 * n] / T,
-            "acceleration": least[4 * n : 4 * n + accelerations] / T**2,
-            "constraint": least[4 * n + accelerations :],
-            "duration": g[-2:],
-        }
-        worst = {name: -float(rows.min(initial=np.inf)) for name, rows in kinds.items()}
-        name = max(worst, key=lambda kind: worst[kind])
-        return (worst[name], name) if worst[name] > 0 else (0.0, "")
+        least[2 * n : 4 * n] /= T
+        least[4 * n : 4 * n + accelerations] /= T**2
+        least = np.append(least, g[-2:].min())
+        worst = int(least.argmin())
+        return (-float(least[worst]), self.names[worst]) if least[worst] < 0 else (0.0, "")
 
     @property
     def arguments(self) -> tuple:

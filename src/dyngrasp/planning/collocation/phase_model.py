@@ -6,7 +6,7 @@ import numpy as np
 
 from dyngrasp.planning.collocation import banded, limit_rows, newton_matrix, three_tap
 from dyngrasp.planning.collocation.limit_rows import LimitRows
-from dyngrasp.planning.collocation.node_functions import NodeFunctions, node_functions
+from dyngrasp.planning.collocation.node_functions import NodeFunctions
 from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, ThreeTap
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
@@ -39,19 +39,17 @@ class PhaseModel:
     Attributes:
         factor: Weight of the objective: 1, or 0 where only the violation is minimised.
         corner: Entry of T in the Newton matrix.
+        complement: What is left of it when x is eliminated.
     """
 
-    def __init__(self, problem: PhaseProblem, work: dict[tuple, WorkArrays]) -> None:
-        self.problem = problem
-        self.functions: list[NodeFunctions] = [node_functions(c) for c in problem.constraints]
-        self.limits = LimitRows.of(problem, self.functions)
+    def __init__(
+        self, problem: PhaseProblem, functions: list[NodeFunctions], limits: LimitRows, work: WorkArrays
+    ) -> None:
+        self.problem, self.functions, self.limits, self.work = problem, functions, limits, work
         self.map = ThreeTap.of(problem)
         self.factor = 1.0
-        shape = problem.intervals + 1, problem.joints, self.limits.constraint_rows, self.limits.rows_per_point
-        if shape not in work:
-            work[shape] = WorkArrays(*shape)
-        self.work = work[shape]
-        self._arguments = self.limits.arguments
+        self.corner = self.complement = np.nan
+        self._arguments = limits.arguments
         self._T = 1.0
 
     @property

@@ -5,18 +5,27 @@ Cost and memory grow linearly with the number of grid points. Every array is all
 
 from __future__ import annotations
 
+import functools
+import logging
 import time
+import weakref
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from dyngrasp.planning.collocation import closed_form
-from dyngrasp.planning.collocation.interior_point import InteriorPoint, InteriorPointSettings, Outcome
+from dyngrasp.planning.collocation.interior_point import InteriorPoint
+from dyngrasp.planning.collocation.iterates import InteriorPointSettings, Outcome
+from dyngrasp.planning.collocation.limit_rows import LimitRows
+from dyngrasp.planning.collocation.node_functions import InterpretedNodeFunctions, NodeFunctions, node_functions
 from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
 from dyngrasp.planning.collocation.three_tap import CURVATURE
-from dyngrasp.planning.problem import PhaseProblem, Solution, Status
+from dyngrasp.planning.problem import MIN_INTERVALS, NodeConstraint, PhaseProblem, Solution, Status
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,33 +66,42 @@ _WORDS = {
 }
 
 
+KEPT = 16  # problem sizes whose arrays, and solutions whose multipliers, are kept
+
+
 class StructuredSolver:
-    """Solves phases; keeps work arrays and compiled functions from one phase to the next."""
+    """Solves phases; keeps work arrays from one phase to the next, and the multipliers of its last solutions."""
 
     def __init__(self, settings: StructuredSettings | None = None) -> None:
         self.settings = settings or StructuredSettings()
-        self._work: dict[tuple, WorkArrays] = {}
-        self._methods: dict[tuple, InteriorPoint] = {}
+        self._methods: dict[tuple, tuple[WorkArrays, InteriorPoint]] = {}
+        self._solved: list[_Solved] = []
 
     def solve(self, problem: PhaseProblem, guess: Trajectory | None = None) -> Solution:
         """Solve one phase.
 
         Args:
             problem: What is asked.
-            guess: Where to start if limits are active: a motion of any duration on any grid, as the rest of a plan.
+            guess: Where to start if limits are active: a motion of any duration on any grid, as the rest of a plan. If
+                it is a trajectory that this solver returned lately, the solver starts from its multipliers too.
 
         Returns:
             The solution. Failures are statuses; a trajectory is given even then, if there is a finite one, and it
-            satisfies the dynamics and the boundary states.
+            satisfies the dynamics and the boundary states. Functions that have to be compiled first do not count
+            towards the time limit.
         """
         # Numbers beyond the range of floats are an outcome here, reported as a status.
         with np.errstate(all="ignore"):
-            return self._solve(problem, guess)
+            functions = [node_functions(constraint) for constraint in problem.constraints]
+            compile_kernels()
+            return self._solve(problem, functions, guess)
 
-    def _solve(self, problem: PhaseProblem, guess: Trajectory | None) -> Solution:
+    def _solve(self, problem: PhaseProblem, functions: list[NodeFunctions], guess: Trajectory | None) -> Solution:
         began = time.perf_counter()
         settings = self.settings
-        model = PhaseModel(problem, self._work)
+        limits = LimitRows.of(problem, functions)
+        work, method = self._kept(problem, limits)
+        model = PhaseModel(problem, functions, limits, work)
         g = np.empty(model.rows)
         optimum = closed_form.unconstrained_optimum(problem)
         x, T = model.map.unknowns(optimum), optimum.duration
@@ -91,68 +109,97 @@ class StructuredSolver:
         at_ends, name = model.violation_at_the_ends()
         shortest = float((np.abs(problem.end_position - problem.start_position) / problem.velocity_limit).max())
         if not np.isfinite(at_ends):
-            return self._refused(problem, began, f"{name} is not finite at a boundary", Status.NONFINITE)
+            return _refused(problem, began, f"{name} is not finite at a boundary", Status.NONFINITE)
         if at_ends > settings.violation_tolerance:
-            return self._refused(problem, began, f"{name} is violated at a boundary by {at_ends:.1e} of its scale")
+            return _refused(problem, began, f"{name} is violated at a boundary by {at_ends:.1e} of its scale")
         if shortest > problem.max_duration * (1 + settings.violation_tolerance):
-            return self._refused(problem, began, f"takes {shortest:.3f} s at top speed")
+            return _refused(problem, began, f"takes {shortest:.3f} s at top speed")
+        violation, _ = limits.violation(g, T)
         prepared = time.perf_counter()
         timings = {"start": 1e3 * (prepared - began)}
-        violation, name = model.limits.violation(g, T)
         if violation <= settings.violation_tolerance:
             timings["total"] = 1e3 * (time.perf_counter() - began)
             message = f"{problem.name}: optimal in closed form"
             return Solution(Status.CONVERGED, optimum, objective, 0, violation, timings, message)
 
-        start = self._stretched(problem, T) if guess is None else on_grid(problem, guess)
-        method = self._method(model)
-        outcome, best, iterations = method.solve(
-            model, model.map.unknowns(start), start.duration, began + settings.time_limit
-        )
+        start = _stretched(problem, T) if guess is None else on_grid(problem, guess)
+        known = self._multipliers(guess, problem.intervals, limits.rows_per_point)
+        deadline = began + settings.time_limit
+        outcome, best, iterations = method.solve(model, model.map.unknowns(start), start.duration, deadline, known)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
-            timings["total"] = 1e3 * (time.perf_counter() - began)
-            message = f"{problem.name}: {_WORDS[Outcome.NONFINITE]}"
-            return Solution(Status.NONFINITE, None, np.nan, iterations, np.inf, timings, message)
+            return _refused(problem, began, _WORDS[Outcome.NONFINITE], Status.NONFINITE, iterations)
         trajectory = closed_form.nearest_trajectory(problem, curvature, best.T)
         objective = model.values(model.map.unknowns(trajectory), best.T, g)
-        violation, name = model.limits.violation(g, best.T)
+        violation, name = limits.violation(g, best.T)
         message = f"{problem.name}: {_WORDS[outcome]}"
         if violation > settings.violation_tolerance:
             message += f"; worst: {name} by {violation:.1e}"
+        if outcome is Outcome.OPTIMAL:
+            self._remember(trajectory, method.multiplier.copy(), limits.rows_per_point)
         timings["total"] = 1e3 * (time.perf_counter() - began)
         return Solution(_STATUS[outcome], trajectory, objective, iterations, violation, timings, message)
 
-    @staticmethod
-    def _refused(problem: PhaseProblem, began: float, why: str, status: Status = Status.INFEASIBLE) -> Solution:
-        timings = {"total": 1e3 * (time.perf_counter() - began)}
-        return Solution(status, None, np.nan, 0, np.inf, timings, f"{problem.name}: {why}")
-
-    def _stretched(self, problem: PhaseProblem, T: float) -> Trajectory:
-        """The motion of least effort, slow enough to keep the speed limits at the grid points if it may be."""
-        for _ in range(3):
-            motion = closed_form.least_effort(problem, T)
-            ratio = float((np.abs(motion.velocity) / problem.velocity_limit).max())
-            if ratio <= 1.001:
-                break
-            # Exact from rest to rest; with moving ends the ratio falls more slowly than 1/T, hence the repetition.
-            T = min(T * ratio, problem.max_duration)
-        return closed_form.least_effort(problem, T)
-
-    def _method(self, model: PhaseModel) -> InteriorPoint:
-        size = (model.problem.intervals, model.problem.joints, model.rows)
-        if size not in self._methods:
+    def _kept(self, problem: PhaseProblem, limits: LimitRows) -> tuple[WorkArrays, InteriorPoint]:
+        """Arrays of this problem size; those used longest ago make room."""
+        size = (problem.intervals + 1, problem.joints, limits.constraint_rows, limits.rows_per_point)
+        kept = self._methods.pop(size, None)
+        if kept is None:
             settings = self.settings
-            self._methods[size] = InteriorPoint(
-                InteriorPointSettings(
-                    settings.tolerance,
-                    settings.violation_tolerance,
-                    settings.max_iterations,
-                    settings.initial_barrier,
-                )
-            )
-        return self._methods[size]
+            numbers = (settings.tolerance, settings.violation_tolerance, settings.max_iterations)
+            kept = WorkArrays(*size), InteriorPoint(InteriorPointSettings(*numbers, settings.initial_barrier))
+        self._methods[size] = kept
+        while len(self._methods) > KEPT:
+            del self._methods[next(iter(self._methods))]
+        return kept
+
+    def _remember(self, trajectory: Trajectory, multipliers: Array, rows_per_point: int) -> None:
+        self._solved.append(_Solved(weakref.ref(trajectory), multipliers, rows_per_point))
+        self._solved = [solved for solved in self._solved if solved.trajectory() is not None][-KEPT:]
+
+    def _multipliers(self, guess: Trajectory | None, intervals: int, rows_per_point: int) -> Array | None:
+        """Multipliers of the solution that the guess is, brought to another grid; None if it is none of the last."""
+        for solved in self._solved:
+            if guess is not None and solved.trajectory() is guess and solved.rows_per_point == rows_per_point:
+                return solved.on_grid(intervals)
+        return None
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A trajectory that was returned, and its multipliers (K · R + 2,)."""
+
+    trajectory: weakref.ref[Trajectory]
+    multipliers: Array
+    rows_per_point: int
+
+    def on_grid(self, intervals: int) -> Array:
+        """Multipliers on another grid; their sum over the grid points stays, as each stands for 1/N of the time."""
+        rows = self.multipliers[:-2].reshape(-1, self.rows_per_point)
+        old = np.linspace(0.0, 1.0, len(rows))
+        new = np.linspace(0.0, 1.0, intervals + 1)
+        at_points = np.stack([np.interp(new, old, column) for column in rows.T], axis=1)
+        return np.concatenate([at_points.ravel() * (len(rows) - 1) / intervals, self.multipliers[-2:]])
+
+
+def _refused(
+    problem: PhaseProblem, began: float, why: str, status: Status = Status.INFEASIBLE, iterations: int = 0
+) -> Solution:
+    timings = {"total": 1e3 * (time.perf_counter() - began)}
+    return Solution(status, None, np.nan, iterations, np.inf, timings, f"{problem.name}: {why}")
+
+
+def _stretched(problem: PhaseProblem, T: float) -> Trajectory:
+    """The motion of least effort, slow enough to keep the speed limits at the grid points if it may be."""
+    for _ in range(3):
+        motion = closed_form.least_effort(problem, T)
+        ratio = float((np.abs(motion.velocity) / problem.velocity_limit).max())
+        if ratio <= 1.001:
+            break
+        # Exact from rest to rest; with moving ends the ratio falls more slowly than 1/T, hence the repetition.
+        T = min(T * ratio, problem.max_duration)
+    return closed_form.least_effort(problem, T)
 
 
 def on_grid(problem: PhaseProblem, guess: Trajectory) -> Trajectory:
@@ -161,5 +208,29 @@ def on_grid(problem: PhaseProblem, guess: Trajectory) -> Trajectory:
     shortest = max(problem.min_duration, min(closed_form.SHORTEST_DURATION, problem.max_duration))
     duration = float(np.clip(guess.duration, shortest, problem.max_duration))
     _, _, acceleration = guess.sample_many(times)
-    curvature: Array = guess.duration**2 * acceleration
-    return closed_form.nearest_trajectory(problem, curvature, duration)
+    return closed_form.nearest_trajectory(problem, guess.duration**2 * acceleration, duration)
+
+
+@functools.cache
+def compile_kernels() -> None:
+    """Have every compiled loop of this folder ready: one small problem, once a process.
+
+    The first time on a machine this takes seconds, afterwards the loops come from the cache beside the sources.
+    """
+    _log.info("preparing the structured solver (some seconds the first time on a machine)")
+    one = np.ones(1)
+    row = ca.Function("row", [q := ca.SX.sym("q", 1), ca.SX.sym("v", 1), ca.SX.sym("p", 0)], [q])
+    rows = NodeConstraint("row", row, np.zeros((MIN_INTERVALS + 1, 0)), -one, 0.9 * one, one)
+    problem = PhaseProblem(
+        "preparation", 0 * one, 0 * one, 0.5 * one, 0 * one, -one, one, 0.2 * one, one, (rows,), MIN_INTERVALS
+    )
+    functions: list[NodeFunctions] = [InterpretedNodeFunctions(row)]
+    limits = LimitRows.of(problem, functions)
+    work = WorkArrays(MIN_INTERVALS + 1, 1, limits.constraint_rows, limits.rows_per_point)
+    model = PhaseModel(problem, functions, limits, work)
+    start = closed_form.least_effort(problem, 1.0)
+    x = model.map.unknowns(start)
+    for adaptive in (True, False):
+        method = InteriorPoint(InteriorPointSettings(max_iterations=3, adaptive=adaptive))
+        method.solve(model, x, 1.0, np.inf)
+        method.solve(model, x, 1.0, np.inf, method.multiplier.copy())

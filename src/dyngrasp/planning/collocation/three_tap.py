@@ -11,8 +11,9 @@ The boundary states at k = 0 fix the neighbours of r[0],
 
     r[±1] = 2 q_S − r[0] ± h T q̇_S,
 
-and likewise those of r[N]. What is left are the N − 1 unknowns x = (r[0], r[2], …, r[N−2], r[N]) a joint, and T, without
-any equality constraint. Every grid point depends on at most three consecutive unknowns, the ones near the ends also on T:
+and likewise those of r[N]. What is left are the N − 1 unknowns x = (r[0], r[2], …, r[N−2], r[N]) a joint, and T,
+without any equality constraint. Every grid point depends on at most three consecutive unknowns, the ones near the ends
+also on T:
 
     z[k] = Σ_b taps[k, b] x[first[k] + b] + offset[k] + T slope[k]      for z = q, w and a.
 """
