@@ -46,7 +46,7 @@ class CollocationSettings:
     torque_fraction: float = 0.9
     position_margin: float = 0.01
     funnel_margin: float = 0.002
-    hold_safety: float = 2.0
+    hold_safety: float = 1.5
     max_duration: float = 30.0
 
     def __post_init__(self) -> None:
@@ -211,6 +211,8 @@ class CollocationPlanner:
         inner_lower = limits.position_lower + settings.position_margin
         inner_upper = limits.position_upper - settings.position_margin
         lowest, highest = np.minimum(start.position, end.position), np.maximum(start.position, end.position)
+        # A moving start may be a little faster than the fraction: speed peaks between the grid points too.
+        fastest = np.maximum(np.abs(start.velocity), np.abs(end.velocity))
         return PhaseProblem(
             name=name,
             start_position=start.position,
@@ -219,7 +221,9 @@ class CollocationPlanner:
             end_velocity=end.velocity,
             position_lower=np.maximum(np.minimum(inner_lower, lowest), limits.position_lower),
             position_upper=np.minimum(np.maximum(inner_upper, highest), limits.position_upper),
-            velocity_limit=settings.velocity_fraction * limits.velocity,
+            velocity_limit=np.minimum(
+                np.maximum(settings.velocity_fraction * limits.velocity, fastest), limits.velocity
+            ),
             acceleration_limit=limits.acceleration,
             constraints=rows,
             intervals=settings.intervals,
@@ -271,21 +275,17 @@ class CollocationPlanner:
             task.robot,
             self._T_flange_object(targets).act(task.grasp_object.spatial_inertia),
             T_flange_grasp,
-            task.grasp_object.friction,
-            task.gripper.pinch_force,
+            task.pinch(targets.grasp),
             self.settings.intervals,
             self.settings.hold_safety,
         )
 
     def _above_ground(self, targets: GraspTargets) -> NodeConstraint:
         T, corners = self._T_flange_object(targets), self.task.grasp_object.underside
-        standing = corners @ targets.T_world_object.rotation.T + targets.T_world_object.translation
-        # An estimate may put a standing part a little into the ground: then it need not rise faster than it can.
-        sunk = np.maximum(0.0, -standing[:, 2])
-        rows = constraints.above_ground(
-            self.task.robot, corners @ T.rotation.T + T.translation, self.settings.intervals
-        )
-        return replace(rows, lower=rows.lower - sunk)
+        place = self.task.robot.forward_kinematics(targets.place.position) * T
+        start, end = ((pose.act(corner)[2] for corner in corners) for pose in (targets.T_world_object, place))
+        floor = constraints.lift_floor(list(start), list(end), self.settings.intervals)
+        return constraints.above_ground(self.task.robot, corners @ T.rotation.T + T.translation, floor)
 
     def _T_flange_object(self, targets: GraspTargets) -> pin.SE3:
         """The part in the flange frame as the closed hand holds it."""

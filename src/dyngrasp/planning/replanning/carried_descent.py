@@ -35,8 +35,8 @@ class DescentSettings:
     """
 
     height: float = 1.05
-    earliest: float = 0.35
-    stiffness: float = 20.0
+    earliest: float = 0.2
+    stiffness: float = 50.0
 
 
 def carried_descent(

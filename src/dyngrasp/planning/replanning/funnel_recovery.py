@@ -1,12 +1,11 @@
 """What becomes of the funnel when a new pose leaves the present state outside of it.
 
-Rule: the height of the funnel's wall is multiplied at time t by
+Rule: over the rest of the approach, s from 0 at the splice to 1 at the pre-grasp, the height of the funnel's wall is multiplied by
 
-    φ(t) = min(1, φ_0 + (1 − φ_0) (t − t_splice) / τ),
+    φ(s) = min(1, φ_0 + (1 − φ_0) s / σ),
 
-where φ_0 ≤ 1 is the largest factor that leaves the hand inside at the splice, and τ a given time, at most the given share of what is left
-of the approach. A state inside the funnel has φ_0 = 1, and nothing is softened. Below the grasp frame no factor helps: such a state
-is refused.
+where φ_0 ≤ 1 is the largest factor that leaves the hand inside at the splice, and σ < 1 a given share. A state inside the funnel has φ_0 = 1, and
+nothing is softened. Below the grasp frame no factor helps: such a state is refused.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
-from dyngrasp.planning.problem import AuditEntry, AuditReport, NodeConstraint
+from dyngrasp.planning.problem import AuditReport, NodeConstraint
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import GraspPlan
 
@@ -25,6 +24,9 @@ _HEIGHT_PARAMETER = 15
 
 # The state at the splice lies this share inside the softened wall, so that an interior point remains.
 _INSIDE = 0.98
+
+# Asked of the solver at the grid points (m), for the hand cuts corners between them.
+_MARGIN = 0.001
 
 _SUBSTEPS = 4  # as the audit
 
@@ -35,24 +37,23 @@ class FunnelRecovery:
 
     Attributes:
         factor: φ_0; 1 where the state at the splice is inside the funnel.
-        start: t_splice (s).
-        duration: τ (s).
+        share: σ.
     """
 
     factor: float
-    start: float
-    duration: float
+    share: float
 
-    def at(self, times: Array) -> Array:
-        """φ at times (M,) of the common clock (s)."""
-        return np.minimum(1.0, self.factor + (1.0 - self.factor) * (times - self.start) / self.duration)
+    def at(self, s: Array) -> Array:
+        """φ at shares s (M,) of the rest of the approach."""
+        return np.minimum(1.0, self.factor + (1.0 - self.factor) * s / self.share)
 
-    def soften(self, constraint: NodeConstraint, duration: float) -> NodeConstraint:
-        """The constraint "funnel" of an approach that starts at the splice and takes `duration` (s)."""
+    def soften(self, constraint: NodeConstraint) -> NodeConstraint:
+        """The constraint "funnel" of an approach that starts at the splice."""
+        if self.factor >= 1.0:
+            return constraint
         parameters = constraint.parameters.copy()
-        nodes = self.start + np.linspace(0.0, duration, len(parameters))
-        parameters[:, _HEIGHT_PARAMETER] *= self.at(nodes)
-        return replace(constraint, parameters=parameters, lower=np.zeros(1))
+        parameters[:, _HEIGHT_PARAMETER] *= self.at(np.linspace(0.0, 1.0, len(parameters)))
+        return replace(constraint, parameters=parameters, lower=np.array([_MARGIN]))
 
     def judge(self, report: AuditReport, plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditReport:
         """The report with its entry "funnel" replaced by the softened one, where the state at the splice is outside."""
@@ -61,13 +62,13 @@ class FunnelRecovery:
         approach, hand = plan.arm[0], plan.gripper[0]
         local = np.linspace(0.0, approach.duration, _SUBSTEPS * approach.intervals + 1)
         q, q_h = approach.sample_many(local)[0], hand.sample_many(local)[0]
-        times = plan.start_time + local
+        times, s = plan.start_time + local, local / approach.duration
         height, wall = np.array(
             [_height_and_wall(a, b, t, targets, task) for a, b, t in zip(q, q_h, times, strict=True)]
         ).T
-        h = height - self.at(times) * wall
+        h = height - self.at(s) * wall
         worst = int(h.argmin())
-        detail = f"softened: wall from {self.factor:.2f} of its height, whole after {self.duration:.2f} s"
+        detail = f"softened: wall from {self.factor:.2f} of its height"
         entries = tuple(
             replace(entry, worst=float(h[worst]), time=float(times[worst]), detail=detail)
             if entry.name == "funnel"
@@ -78,7 +79,7 @@ class FunnelRecovery:
 
 
 def funnel_recovery(
-    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, longest: float, share: float
+    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, share: float
 ) -> FunnelRecovery | None:
     """The softening that a replan needs; None if the hand is below the grasp frame and no softening helps.
 
@@ -87,21 +88,20 @@ def funnel_recovery(
         targets: The new targets.
         task: Arm, gripper, part.
         splice: When the new trajectory takes over (s).
-        longest: Largest τ (s).
-        share: Largest part of the rest of the approach that τ may take.
+        share: σ.
     """
     state = plan.sample(splice)
     height, wall = _height_and_wall(state.arm.position, state.gripper.position, splice, targets, task)
-    duration = max(min(longest, share * (plan.phase_ends[0] - splice)), 1e-3)
-    if height >= wall:
-        return FunnelRecovery(1.0, splice, duration)
-    if height <= 0:
+    if height - wall >= _MARGIN:
+        return FunnelRecovery(1.0, share)
+    inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
+    if inside <= 0:
         return None
-    return FunnelRecovery(_INSIDE * height / wall, splice, duration)
+    return FunnelRecovery(inside / wall, share)
 
 
 def _height_and_wall(q: Array, q_h: Array, t: float, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
-    """z of G in the grasp frame and the height of the wall there, eq. (6) (m)."""
+    """Z of G in the grasp frame and the height of the wall there, eq. (6) (m)."""
     gripper, funnel = task.gripper, task.grasp_object.funnel
     T_hand = task.robot.forward_kinematics(q) * gripper.T_flange_hand
     G = T_hand.act(gripper.grasp_point(q_h))

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
 
 import numpy as np
 
-from dyngrasp.errors import DyngraspError, InvalidProblem, OutOfReach, PlanningFailed
+from dyngrasp.errors import GraspRefused, InvalidProblem, OutOfReach, PlanningFailed
 from dyngrasp.planning.audit import audit
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, moved
-from dyngrasp.planning.problem import AuditReport, PhaseProblem, PhaseSolver, PlanResult, Status
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
+from dyngrasp.planning.problem import AuditReport, PhaseSolver, Status
+from dyngrasp.planning.replanning.full_problem import FullProblem, PhasePlanner
 from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, funnel_recovery
 from dyngrasp.planning.replanning.splice import (
     APPROACH,
@@ -21,13 +21,12 @@ from dyngrasp.planning.replanning.splice import (
     GRASP,
     Candidate,
     TrackingSettings,
-    hold_start,
     splice_time,
     track,
 )
 from dyngrasp.planning.replanning.target_update import target_updater
-from dyngrasp.signals import Array, JointState, PoseEstimate
-from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
+from dyngrasp.signals import PoseEstimate
+from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan
 
 
 class Path(StrEnum):
@@ -37,22 +36,6 @@ class Path(StrEnum):
     REOPTIMISED = "reoptimised"
     FRESH = "fresh"
     KEPT = "kept"
-
-
-class PhasePlanner(Protocol):
-    """What plans whole phases under all constraints; the replanner falls back on it."""
-
-    def phase_problems(
-        self, q_start: JointState, targets: GraspTargets, gripper_start: Array | None = None
-    ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
-        """The problems of the three phases from a moving start."""
-        ...
-
-    def plan(
-        self, q_start: JointState, targets: GraspTargets, gripper_start: Array | None = None, start_time: float = 0.0
-    ) -> PlanResult:
-        """A whole plan from a moving start."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -66,7 +49,7 @@ class ReplannerSettings:
         least_horizon: Shorter rests of a phase are not touched (s): nothing could be corrected in them but violently.
         finger_clearance: Grasp updates end when the closing gap is within twice this of the part's width (m): from then on
             the fingers meet the part, which moves with them and not with its estimate.
-        recovery_time, recovery_share: τ of `funnel_recovery`.
+        recovery_share: σ of `funnel_recovery`.
         settled: A moving part's grasp time is iterated until the predicted part moves less than this (m).
         gate: Whether the audit decides on publication. It does, but where the paper's own method is to be shown as it is.
     """
@@ -76,7 +59,6 @@ class ReplannerSettings:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     least_horizon: float = 0.06
     finger_clearance: float = 0.004
-    recovery_time: float = 0.5
     recovery_share: float = 0.6
     settled: float = 1e-7
     gate: bool = True
@@ -148,7 +130,9 @@ class Replanner:
         """
         self.task = task
         self.settings = settings or ReplannerSettings()
-        self.solver, self.planner = solver, planner
+        self.full: FullProblem | None = None
+        if solver is not None and planner is not None:
+            self.full = FullProblem(task, planner, solver, self.settings.tracking)
         self._clock = clock
 
     def replan(self, plan: GraspPlan, targets: GraspTargets, t: float) -> ReplanResult:
@@ -184,7 +168,7 @@ class _Attempt:
 
     def __init__(self, replanner: Replanner, plan: GraspPlan, t: float) -> None:
         self.task, self.settings = replanner.task, replanner.settings
-        self.solver, self.planner = replanner.solver, replanner.planner
+        self.full = replanner.full
         self.plan, self.t = plan, t
         self.clock = replanner._clock
         self.began = self.clock()
@@ -234,10 +218,8 @@ class _Attempt:
             return self._kept(Status.INFEASIBLE, targets, refusal)
         phase = self.plan.phase_at(self.splice)
         if phase == APPROACH:
-            settings = self.settings
-            self.recovery = funnel_recovery(
-                self.plan, targets, self.task, self.splice, settings.recovery_time, settings.recovery_share
-            )
+            share = self.settings.recovery_share
+            self.recovery = funnel_recovery(self.plan, targets, self.task, self.splice, share)
             if self.recovery is None:
                 return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
         candidate = self._track(targets)
@@ -253,7 +235,7 @@ class _Attempt:
             self.reasons.append(f"tracking: {_failures(self.report)}")
             if self._late(self.settings.budget):
                 return self._kept(Status.DEADLINE_MISSED, targets, "no time for the full problem")
-            if self.solver is not None and self.planner is not None and phase == APPROACH:
+            if self.full is not None and phase == APPROACH:
                 found = self._reoptimised(candidate.plan, targets)
                 if found is not None:
                     return self._published(found, targets, Path.REOPTIMISED, self.settings.budget)
@@ -293,103 +275,72 @@ class _Attempt:
 
     def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> GraspPlan | None:
         """Solve the phases that the audit refuses under all constraints, from the candidate; None if that does not help."""
-        assert self.planner is not None
-        assert self.solver is not None
+        assert self.full is not None
         assert self.report is not None
-        started = self.clock()
+        assert self.recovery is not None
         state = self.plan.sample(self.splice)
-        try:
-            problems = self.planner.phase_problems(state.arm, targets, state.gripper.position)
-        except DyngraspError as error:
-            self.reasons.append(f"full problem: {error}")
-            self._count("reoptimise", started)
-            return None
-        solved: set[int] = set()
-        plan, report = candidate, self.report
-        while not self._late(self.settings.budget):
-            refused = {int(candidate.phase_at(min(e.time, plan.end_time))) for e in report.failures} - solved
-            if not refused:
-                break
-            for phase in sorted(refused):
-                problem = self._softened(problems[phase], plan) if phase == APPROACH else problems[phase]
-                solution = self.solver.solve(problem, plan.arm[phase])
-                if not solution.ok:
-                    self.reasons.append(f"full problem: {solution.message}")
-                    self._count("reoptimise", started)
-                    return None
-                motion = solution.require()
-                if phase == APPROACH:
-                    held = hold_start(motion, state.arm, targets.pregrasp, self.task, self.settings.tracking)
-                    if held is None:
-                        self.reasons.append("full problem: the acceleration at the splice cannot be met")
-                        self._count("reoptimise", started)
-                        return None
-                    motion = held
-                plan = _with_phase(plan, phase, motion)
-                solved.add(phase)
-            self._count("reoptimise", started)
-            report = self._audited(plan, targets)
-            started = self.clock()
-            if report.ok:
-                self.report = report
-                return plan
+        started = self.clock()
+        left = float(self.plan.phase_ends[APPROACH]) - self.splice
+        problems, why = self.full.problems(state, left, targets, self.recovery)
         self._count("reoptimise", started)
-        self.report = report
-        self.reasons.append(f"full problem: {_failures(report)}" if not report.ok else "full problem: out of time")
+        solved: set[int] = set()
+        plan = candidate
+        while problems is not None:
+            refused = {plan.phase_at(min(entry.time, plan.end_time)) for entry in self.report.failures} - solved
+            if not refused or self._late(self.settings.budget):
+                why = _failures(self.report)
+                break
+            started = self.clock()
+            improved, why = self.full.improve(
+                plan, refused, problems, state, targets, lambda: self._late(self.settings.budget)
+            )
+            self._count("reoptimise", started)
+            if improved is None:
+                break
+            plan, solved = improved, solved | refused
+            self.report = self._audited(plan, targets)
+            if self.report.ok:
+                return plan
+        self.reasons.append(f"full problem: {why}")
         return None
-
-    def _softened(self, problem: PhaseProblem, plan: GraspPlan) -> PhaseProblem:
-        recovery = self.recovery
-        if recovery is None or recovery.factor >= 1.0:
-            return problem
-        rows = tuple(
-            recovery.soften(row, plan.durations[APPROACH]) if row.name == "funnel" else row
-            for row in problem.constraints
-        )
-        return replace(problem, constraints=rows)
 
     def _fresh_or_kept(
         self, targets: GraspTargets, estimate: PoseEstimate | None, reason: str, status: Status = Status.INFEASIBLE
     ) -> ReplanResult:
+        """Plan anew from where the arm will be after the longer budget; the old plan bridges that time."""
         if reason:
             self.reasons.append(reason)
-        settings, plan = self.settings, self.plan
-        splice = splice_time(plan, self.t + settings.fresh_budget)
+        budget, plan = self.settings.fresh_budget, self.plan
+        splice = self.t + budget
         left = float(plan.phase_ends[APPROACH]) - splice
-        if self.planner is None or left < settings.least_horizon or self._late(settings.fresh_budget):
+        if self.full is None or left < self.settings.least_horizon or self._late(budget):
             return self._kept(status, targets, "")
-        started = self.clock()
         state = plan.sample(splice)
-        if state.gripper.velocity.any():
-            return self._kept(status, targets, "a fresh plan needs the hand at rest")
-        T = targets.T_world_object
-        if estimate is not None and not estimate.twist_world.any():
-            T = estimate.T_world_object
+        waits = np.abs(state.gripper.position - targets.gripper_open).max() <= JOIN_TOLERANCE
+        if not waits or state.gripper.velocity.any():
+            return self._kept(status, targets, "fresh plan: the hand is not open and at rest")
+        started = self.clock()
         try:
-            from_here = self._fresh_targets(T, state.arm.position, targets)
-            result = self.planner.plan(state.arm, from_here, state.gripper.position, splice)
-        except DyngraspError as error:
+            if not targets.moving:
+                T = targets.T_world_object if estimate is None else estimate.T_world_object
+                targets = grasp_targets(T, self.task, state.arm.position)
+        except (OutOfReach, GraspRefused) as error:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
+        recovery = funnel_recovery(plan, targets, self.task, splice, self.settings.recovery_share)
+        fresh, why = None, "the hand is beside the part, below the new grasp frame"
+        if recovery is not None:
+            problems, why = self.full.problems(state, left, targets, recovery)
+            if problems is not None:
+                fresh, why = self.full.fresh(plan, splice, problems, state, targets)
         self._count("fresh", started)
-        if not result.ok or result.plan is None:
-            return self._kept(result.status, targets, f"fresh plan: {result.message}")
-        held = hold_start(result.plan.arm[APPROACH], state.arm, from_here.pregrasp, self.task, settings.tracking)
-        if held is None:
-            return self._kept(Status.INFEASIBLE, targets, "fresh plan: the acceleration at the splice cannot be met")
-        self.splice, self.recovery = splice, None
-        fresh = _with_phase(result.plan, APPROACH, held)
-        self.report = self._audited(fresh, from_here)
+        if fresh is None:
+            return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {why}")
+        self.splice, self.recovery = splice, recovery
+        self.report = self._audited(fresh, targets)
         if not self.report.ok:
             return self._kept(Status.AUDIT_FAILED, targets, f"fresh plan: {_failures(self.report)}")
-        return self._published(fresh, from_here, Path.FRESH, settings.fresh_budget)
-
-    def _fresh_targets(self, T_world_object, q: Array, targets: GraspTargets) -> GraspTargets:
-        from dyngrasp.planning.grasp_targets import grasp_targets
-
-        if targets.moving:
-            return targets
-        return grasp_targets(T_world_object, self.task, q)
+        return self._published(fresh, targets, Path.FRESH, budget)
 
     def _late(self, budget: float) -> bool:
         return self.clock() - self.began > budget
@@ -436,15 +387,6 @@ class _Attempt:
             message,
             self.iterations,
         )
-
-
-def _with_phase(plan: GraspPlan, phase: int, motion: Trajectory) -> GraspPlan:
-    """The plan with one phase of the arm replaced, the hand's path stretched to its duration."""
-    from dyngrasp.planning.replanning.splice import stretched
-
-    arm, hand = list(plan.arm), list(plan.gripper)
-    arm[phase], hand[phase] = motion, stretched(hand[phase], motion.duration)
-    return replace(plan, arm=tuple(arm), gripper=tuple(hand))
 
 
 def _failures(report: AuditReport) -> str:

@@ -1,0 +1,126 @@
+"""Where the quadratic program does not do: the phases under all constraints, torque and funnel included, by a solver of whole phases.
+
+Planner and solver are given from outside; this module asks for the problems from the moving start, softens the funnel by the stated rule,
+solves, and joins the answers to the running plan with the acceleration that it has at the splice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from dyngrasp.errors import DyngraspError
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.problem import PhaseProblem, PhaseSolver, Solution
+from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery
+from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, hold_start, stretched
+from dyngrasp.signals import Array, JointState
+from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory
+
+
+class PhasePlanner(Protocol):
+    """What states the problems of whole phases; the offline planner does."""
+
+    def phase_problems(
+        self, q_start: JointState, targets: GraspTargets, gripper_start: Array | None = None
+    ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
+        """The problems of the three phases from a moving start."""
+        ...
+
+    def guess(self, problem: PhaseProblem, targets: GraspTargets) -> Trajectory | None:
+        """Where to start a phase if there is no better idea."""
+        ...
+
+
+@dataclass(frozen=True)
+class FullProblem:
+    """The three phases from a splice in the approach on.
+
+    Attributes:
+        task: Arm, gripper, part.
+        planner: States the problems.
+        solver: Solves one.
+        settings: For the acceleration at the splice.
+        detour: How much longer than what was left of it the approach may become (s). On a grid stretched over a long detour the
+            steps would be coarse enough to pass through the funnel's wall unseen.
+    """
+
+    task: GraspTask
+    planner: PhasePlanner
+    solver: PhaseSolver
+    settings: TrackingSettings
+    detour: float = 1.5
+
+    def problems(
+        self, state: PlanSample, left: float, targets: GraspTargets, recovery: FunnelRecovery
+    ) -> tuple[tuple[PhaseProblem, ...] | None, str]:
+        """The problems from a state of the running plan with `left` (s) of its approach, or None and why there are none."""
+        try:
+            problems = self.planner.phase_problems(state.arm, targets, state.gripper.position)
+        except DyngraspError as error:
+            return None, str(error)
+        rows = tuple(recovery.soften(row) if row.name == "funnel" else row for row in problems[APPROACH].constraints)
+        shortest = problems[APPROACH].min_duration
+        longest = max(min(problems[APPROACH].max_duration, left + self.detour), shortest)
+        return (replace(problems[APPROACH], constraints=rows, max_duration=longest), *problems[1:]), ""
+
+    def improve(
+        self,
+        plan: GraspPlan,
+        phases: set[int],
+        problems: tuple[PhaseProblem, ...],
+        state: PlanSample,
+        targets: GraspTargets,
+        late: Callable[[], bool],
+    ) -> tuple[GraspPlan | None, str]:
+        """The plan with some phases solved anew, from what they are in it; None and why if one of them fails."""
+        for phase in sorted(phases):
+            solution = self.solver.solve(problems[phase], plan.arm[phase])
+            if not solution.ok and phase == APPROACH and not late():
+                # The old motion leads into the wall where the hand has to rise first: come down the funnel anew.
+                solution = self._from_above(problems[phase], targets, solution)
+            motion, why = self._joined(solution, phase, state, targets)
+            if motion is None:
+                return None, why
+            arm, hand = list(plan.arm), list(plan.gripper)
+            arm[phase], hand[phase] = motion, stretched(hand[phase], motion.duration)
+            plan = replace(plan, arm=tuple(arm), gripper=tuple(hand))
+        return plan, ""
+
+    def fresh(
+        self,
+        running: GraspPlan,
+        splice: float,
+        problems: tuple[PhaseProblem, ...],
+        state: PlanSample,
+        targets: GraspTargets,
+    ) -> tuple[GraspPlan | None, str]:
+        """A plan from the splice on that owes nothing to the running one but its state and the paths of its hand."""
+        motions: list[Trajectory] = []
+        for phase, problem in enumerate(problems):
+            solution = self.solver.solve(problem, self.planner.guess(problem, targets))
+            motion, why = self._joined(solution, phase, state, targets)
+            if motion is None:
+                return None, why
+            motions.append(motion)
+        still = np.zeros((motions[APPROACH].intervals + 1, len(running.gripper_joints)))
+        waiting = Trajectory(motions[APPROACH].duration, still + state.gripper.position, still, still)
+        closing = (stretched(path, arm.duration) for path, arm in zip(running.gripper[1:], motions[1:], strict=True))
+        return replace(running, arm=tuple(motions), gripper=(waiting, *closing), start_time=splice), ""
+
+    def _from_above(self, problem: PhaseProblem, targets: GraspTargets, failed: Solution) -> Solution:
+        guess = self.planner.guess(problem, targets)
+        return failed if guess is None else self.solver.solve(problem, guess)
+
+    def _joined(
+        self, solution: Solution, phase: int, state: PlanSample, targets: GraspTargets
+    ) -> tuple[Trajectory | None, str]:
+        if not solution.ok or solution.trajectory is None:
+            return None, solution.message
+        if phase != APPROACH:
+            return solution.trajectory, ""
+        motion = hold_start(solution.trajectory, state.arm, targets.pregrasp, self.task, self.settings)
+        return motion, "" if motion is not None else "the acceleration at the splice cannot be met"
