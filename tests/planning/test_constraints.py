@@ -5,16 +5,16 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from dyngrasp.errors import GraspRefused, InvalidProblem
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.catalogue import load_gripper, load_robot
-from dyngrasp.models.grasp_object import Friction, Funnel
+from dyngrasp.models.grasp_object import Funnel
+from dyngrasp.models.pinch import Pinch, pad_loads
 from dyngrasp.planning import constraints
 from dyngrasp.planning.problem import NodeConstraint
 
 N = 12
 FUNNEL = Funnel(z_threshold=0.1, sigma_x=0.005, sigma_y=0.002)
-FRICTION = Friction(sliding=0.7, torsional=0.008)
-PINCH_N = 16.0
+PINCH = Pinch(force=13.0, sliding=0.7, torsional=0.008, width=0.034)
 PART = pin.Inertia(0.75, np.array([0.004, -0.012, 0.16]), np.array([[9, 1, 2], [1, 8, -1], [2, -1, 3]]) * 1e-4)
 
 
@@ -53,7 +53,7 @@ def everything(iiwa, sdh2, T_flange_grasp, states) -> list[NodeConstraint]:
         constraints.torque_rows(iiwa.with_payload(PART), N, 0.9),
         constraints.funnel(iiwa, points, T, FUNNEL),
         constraints.grasp_tube(iiwa, points, T_flange_grasp.rotation, T),
-        constraints.hold(iiwa, PART, T_flange_grasp, FRICTION, PINCH_N, N),
+        constraints.hold(iiwa, PART, T_flange_grasp, PINCH, N),
     ]
 
 
@@ -120,8 +120,8 @@ def test_grasp_tube_rows(iiwa, T_flange_grasp, states):
         np.testing.assert_array_equal((constraint.lower <= values) & (values <= constraint.upper), within)
 
 
-def test_hold_is_the_wrench_of_the_part_over_the_grip(iiwa, T_flange_grasp, states):
-    constraint = constraints.hold(iiwa, PART, T_flange_grasp, FRICTION, PINCH_N, N, safety=1.5, closing_share=0.4)
+def test_hold_is_the_wrench_of_the_part_shared_by_two_pads(iiwa, T_flange_grasp, states):
+    constraint = constraints.hold(iiwa, PART, T_flange_grasp, PINCH, N, safety=1.5, closing_share=0.4)
     model, data = iiwa.pin_model, iiwa.pin_model.createData()
     for q, v in zip(*states, strict=True):
         pin.forwardKinematics(model, data, q, np.zeros(7), v)
@@ -129,11 +129,50 @@ def test_hold_is_the_wrench_of_the_part_over_the_grip(iiwa, T_flange_grasp, stat
         acceleration = pin.getFrameAcceleration(model, data, iiwa.tip_id, pin.LOCAL)
         acceleration.linear -= data.oMf[iiwa.tip_id].rotation.T @ model.gravity.linear
         wrench = T_flange_grasp.actInv(PART * acceleration)
-        tangential = np.hypot(wrench.linear[0], wrench.linear[2]) / (2 * 0.7 * PINCH_N)
-        torsion = wrench.angular[1] / (2 * 0.008 * PINCH_N)
-        expected = [tangential**2 + torsion**2, wrench.linear[1] / PINCH_N]
+        expected = [load - (normal / 1.5) ** 2 for load, normal in pad_loads(wrench.linear, wrench.angular, PINCH)]
+        expected.append(wrench.linear[1] / PINCH.force)
         np.testing.assert_allclose(evaluate(constraint, q, v), expected, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(constraint.upper, [1 / 2.25, 0.4])
+    np.testing.assert_allclose(constraint.upper, [0.0, 0.0, 0.4])
+
+
+def test_what_the_pads_bear_balances_the_wrench():
+    """Solve the statics of two contacts from scratch: six equations for the forces and torsions of two pads."""
+    random = np.random.default_rng(7)
+    half = np.array([0.0, PINCH.width / 2, 0.0])
+    for _ in range(50):
+        force, moment = random.normal(size=3) * 5, random.normal(size=3) * 0.05
+        # Unknowns: the forces at +y and at −y, and the torsion about y of both together. Statics leaves the squeeze
+        # open; the least-norm solution has none.
+        rows = np.zeros((6, 7))
+        rows[:3, :3] = rows[:3, 3:6] = np.eye(3)
+        rows[3:, :3], rows[3:, 3:6] = pin.skew(half), pin.skew(-half)
+        rows[4, 6] = 1.0
+        solved = np.linalg.lstsq(rows, np.concatenate([force, moment]), rcond=None)[0]
+        loads = pad_loads(force, moment, PINCH)
+        # A force on the part towards +y relieves the pad at +y, which pushes towards −y.
+        for (load, normal), contact, inward in zip(loads, (solved[:3], solved[3:6]), (-1.0, 1.0), strict=True):
+            tangential = np.hypot(contact[0], contact[2]) / (PINCH.sliding * PINCH.force)
+            torsion = moment[1] / (2 * PINCH.torsional * PINCH.force)
+            assert load == pytest.approx(tangential**2 + torsion**2, rel=1e-10)
+            assert normal == pytest.approx(1 + inward * contact[1] / PINCH.force, rel=1e-10)
+
+
+def test_the_floor_under_a_carried_part():
+    floor = constraints.lift_floor([0.0, -0.002], [0.3, 0.3], 10, depth=1e-4)
+    np.testing.assert_allclose(floor[0], [-1e-4, -0.0021])
+    np.testing.assert_allclose(floor[2:], constraints.LIFT_CLEARANCE - 1e-4)
+    # A target on the ground can be reached.
+    on_ground = constraints.lift_floor([0.0, 0.0], [0.0, 0.3], 10)
+    assert (on_ground[-1] <= 0.0).all()
+
+
+def test_above_ground_is_the_height_of_the_corners(iiwa, states):
+    corners = np.random.default_rng(5).normal(size=(8, 3)) * 0.1
+    floor = np.random.default_rng(6).normal(size=(N + 1, 8)) * 0.01
+    constraint = constraints.above_ground(iiwa, corners, floor)
+    for k, q in enumerate(states[0]):
+        heights = [iiwa.forward_kinematics(q).act(corner)[2] for corner in corners]
+        np.testing.assert_allclose(evaluate(constraint, q, np.zeros(7), k), heights - floor[k], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("which", range(4), ids=["torque", "funnel", "grasp_tube", "hold"])
@@ -167,23 +206,7 @@ def test_functions_are_built_once_for_all_payloads_and_poses(iiwa, sdh2, T_flang
         assert a.function.__hash__() == b.function.__hash__()
 
 
-def test_holding_margin_is_the_static_share_and_refuses_what_turns():
-    upright = pin.SE3.Identity()
-    below = pin.Inertia(0.7, np.array([0.005, 0.0, -0.03]), np.eye(3) * 1e-3)
-    force, moment = 0.7 * 9.81 / (2 * 0.7 * PINCH_N), 0.7 * 9.81 * 0.005 / (2 * 0.008 * PINCH_N)
-    margin = constraints.holding_margin(below, upright, FRICTION, PINCH_N)
-    assert margin == pytest.approx(1 / np.hypot(force, moment), rel=1e-12)
-    limit = 2 * 0.008 * PINCH_N / (2 * 0.7 * 9.81)
-    for lever, refused in ((0.999 * limit, False), (1.001 * limit, True), (-1.001 * limit, True)):
-        part = pin.Inertia(0.7, np.array([lever, 0.0, -0.03]), np.eye(3) * 1e-3)
-        if refused:
-            with pytest.raises(GraspRefused, match="torsion"):
-                constraints.holding_margin(part, upright, FRICTION, PINCH_N)
-        else:
-            constraints.holding_margin(part, upright, FRICTION, PINCH_N)
-
-
 @pytest.mark.parametrize("bad", [{"safety": 0.9}, {"closing_share": 1.0}])
 def test_senseless_hold_is_refused(iiwa, T_flange_grasp, bad):
     with pytest.raises(InvalidProblem, match="safety"):
-        constraints.hold(iiwa, PART, T_flange_grasp, FRICTION, PINCH_N, N, **bad)
+        constraints.hold(iiwa, PART, T_flange_grasp, PINCH, N, **bad)

@@ -47,8 +47,9 @@ def grasp_controller(
         grasp: Which grasp is taken; it says how the part hangs in the hand.
         control_period: Of the loop (s).
         arm: Gains of the arm.
-        hand: Gains and forces of the hand.
+        hand: Gains and forces of the hand; by default it presses with the share of its force that the task states.
     """
+    hand = hand or GripperControlSettings(force_fraction=task.settings.grip_share)
     return GraspController(
         task.robot,
         task.gripper,

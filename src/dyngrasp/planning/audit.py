@@ -17,6 +17,7 @@ import pinocchio as pin
 from dyngrasp.models.assembly import Assembly, assemble
 from dyngrasp.models.batch_dynamics import Attachments, BatchModel, wrench_on
 from dyngrasp.models.kinematic_tree import frames_named
+from dyngrasp.models.pinch import pad_loads
 from dyngrasp.planning.clearance import clearance_entries
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry, AuditReport
@@ -272,21 +273,18 @@ def _reversal(G: Array, angles: Array, times: Array, task: GraspTask) -> list[Au
 
 
 def _hold(motion: Array, times: Array, targets: GraspTargets, task: GraspTask, models: _Models) -> AuditEntry:
-    """Share of the pinch's friction limit surface that the part asks for as it is carried, velocity terms included.
+    """Share of its friction that the busier pad needs to carry the part, velocity terms included.
 
-    Two pads pressed with N hold a tangential force 2 μ N and a moment 2 t N about the closing axis; the limit surface
-    is taken as an ellipse. The safety factor is not applied here: at 1 the part would just slip.
+    The safety factor of the planner is not applied here: at 1 the part would just slip.
     """
-    part, robot = task.grasp_object, task.robot
+    robot = task.robot
     in_flange = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_closed)
     frame = models.loaded.attach([(robot.n, robot.T_last_flange * in_flange)])
     T_link_grasp = pin.SE3(frame.rotations[0], frame.positions[0])
-    body = (T_link_grasp * targets.grasp.T_object_grasp.inverse()).act(part.spatial_inertia)
+    body = (T_link_grasp * targets.grasp.T_object_grasp.inverse()).act(task.grasp_object.spatial_inertia)
     wrench = wrench_on(body, motion)
-    closing = T_link_grasp.rotation[:, 1]
-    force, along = wrench[:, :3], wrench[:, :3] @ closing
-    tangential = np.sqrt(np.maximum((force**2).sum(axis=1) - along**2, 0.0))
-    torsion = wrench[:, 3:] @ closing - force @ np.cross(closing, T_link_grasp.translation)
-    per_finger = 2 * task.gripper.pinch_force * np.array([part.friction.sliding, part.friction.torsional])
-    share = np.hypot(tangential / per_finger[0], torsion / per_finger[1])
-    return _at_most("hold", share, times, 1.0, RATIO_TOLERANCE, "of the grip")
+    force = wrench[:, :3] @ T_link_grasp.rotation
+    moment = (wrench[:, 3:] - np.cross(T_link_grasp.translation, wrench[:, :3])) @ T_link_grasp.rotation
+    loads = pad_loads(force.T, moment.T, task.pinch(targets.grasp))
+    shares = [np.sqrt(load) / np.maximum(normal, 1e-9) for load, normal in loads]
+    return _at_most("hold", np.maximum(*shares), times, 1.0, RATIO_TOLERANCE, "of the grip")

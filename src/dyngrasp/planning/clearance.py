@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-import coal
+import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
 import pinocchio as pin
 import trimesh
@@ -226,8 +226,10 @@ def clearance_entries(
     )
     closing = chosen[0].size
     scene = _scene(cell, q, q_h, targets.part_poses(times), closing, closing + chosen[1].size)
-    if not all(np.isfinite(x).all() for x in (scene.R, scene.p, scene.R_part, scene.p_part)):
-        found = dict.fromkeys(_CHECKS, (np.nan, 0, "poses that are not numbers"))
+    # Comparisons would lose a NaN on the way to the least distance.
+    numbers = (scene.R, scene.p, scene.R_part, scene.p_part, *(x for phase in phases for x in phase))
+    if not all(np.isfinite(x).all() for x in numbers):
+        found = dict.fromkeys(_CHECKS, (np.nan, 0, "a motion that is not finite"))
     else:
         world = tracks(scene.R, scene.p, np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3)), cell.capsules)
         seen = tracks(scene.R, scene.p, scene.R_part, scene.p_part, cell.capsules)
@@ -241,10 +243,17 @@ def clearance_entries(
         # The part hangs in the gripper only from the lift on.
         distance, k, who = found["carried_clearance"]
         found["carried_clearance"] = distance, max(k, scene.lifted), who
+    bounds = dict.fromkeys(_CHECKS, 0.0) | {"carried_clearance": -_sunk(task, targets)}
     return [
-        AuditEntry(name, distance, 0.0, True, _CHECKS[name], "m", float(times[k]), who)
+        AuditEntry(name, distance, bounds[name], True, _CHECKS[name], "m", float(times[k]), who)
         for name, (distance, k, who) in found.items()
     ]
+
+
+def _sunk(task: GraspTask, targets: GraspTargets) -> float:
+    """How far an estimate puts the standing part into the ground (m): so deep it may hang when it is lifted."""
+    T, corners = targets.T_world_object, task.grasp_object.underside
+    return max(0.0, -float((corners @ T.rotation[2] + T.translation[2]).min()))
 
 
 # Entries and their tolerances (m).
@@ -317,8 +326,7 @@ def _spread(q: Array) -> Indices:
     for k in range(1, q.shape[0]):
         keep = k == q.shape[0] - 1
         for i in range(q.shape[1]):
-            # A step that is not a number is kept, for the check of the poses to find.
-            keep = keep or not abs(q[min(k + 1, q.shape[0] - 1), i] - q[chosen[used - 1], i]) <= JOINT_STEP
+            keep = keep or abs(q[k + 1, i] - q[chosen[used - 1], i]) > JOINT_STEP
         if keep:
             chosen[used] = k
             used += 1

@@ -15,14 +15,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from dyngrasp.errors import GraspRefused, InvalidProblem
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.models import symbolic
+from dyngrasp.models.pinch import Pinch, pad_loads
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.signals import Array
 
 if TYPE_CHECKING:
-    from dyngrasp.models.grasp_object import Friction, Funnel
+    from dyngrasp.models.grasp_object import Funnel
 
 
 def torque_rows(robot: RobotModel, intervals: int, fraction: float = 1.0) -> NodeConstraint:
@@ -128,112 +129,100 @@ def hold(
     robot: RobotModel,
     part: pin.Inertia,
     T_flange_grasp: pin.SE3,
-    friction: Friction,
-    pinch_force: float,
+    pinch: Pinch,
     intervals: int,
     safety: float = 1.5,
     closing_share: float = 0.5,
 ) -> NodeConstraint:
-    """The pinch carries the part: friction and torsion of two pads under the part's acceleration.
+    """The pinch carries the part: what each pad bears under the part's acceleration, see `models.pinch.pad_loads`.
 
-    The wrench that the part needs at G is taken with q̇ = 0, as in the torque rows. Its force f_t in the plane
-    across the closing axis and its moment m_n about that axis stay within the ellipse (f_t / (2 μ N))² + (m_n / (2
-    t N))² ≤ 1 / safety², a convex approximation of the limit surface of two pads that press with N each. Along the
-    closing axis the force only shifts load between the pads: |f_y| ≤ closing_share · N. Moments across the closing
-    axis are left to the width of the pads.
+    The wrench that the part needs at G is taken with q̇ = 0, as in the torque rows. Rows: for each pad its load less
+    what its normal force allows, ≤ 0 with the safety factor; and the force along the closing axis over N, which
+    shifts load from one pad to the other.
 
     Args:
         robot: The arm.
         part: Inertia of the part in the flange frame.
         T_flange_grasp: The grasp frame in the flange frame as the closed hand holds it, y along the closing axis.
-        friction: Sliding coefficient μ and torsional coefficient t (m).
-        pinch_force: N of one finger (N).
+        pinch: The grip.
         intervals: N of the grid.
-        safety: ≥ 1.
+        safety: ≥ 1; covers the velocity terms, transients, and friction and mass that are not as assumed.
         closing_share: Part of N that acceleration may add to or take from one pad, in (0, 1).
     """
     if safety < 1 or not 0 < closing_share < 1:
         raise InvalidProblem(f"safety must be ≥ 1 and the closing share in (0, 1); got {safety}, {closing_share}")
-    numbers = np.concatenate(
-        [
-            symbolic.payload_vector(part),
-            T_flange_grasp.translation,
-            T_flange_grasp.rotation[:, 1],
-            _inverse_capacities(friction, pinch_force),
-        ]
-    )
+    grip = [pinch.force, pinch.sliding, pinch.torsional, pinch.width, safety]
+    numbers = np.concatenate([symbolic.payload_vector(part), _frame(T_flange_grasp), grip])
 
     def build() -> ca.Function:
-        q, v, p = _inputs(robot, 19)
+        q, v, p = _inputs(robot, 27)
         force, moment = symbolic.payload_wrench(robot)(q, v, p[:10])
-        moment -= ca.cross(p[10:13], force)
-        axis = p[13:16]
-        along = ca.dot(axis, force)
-        tangential = p[16] ** 2 * ca.sumsqr(force - along * axis)
-        rows = ca.vertcat(tangential + (p[17] * ca.dot(axis, moment)) ** 2, p[18] * along)
-        return ca.Function("hold", [q, v, p], [rows], ["q", "v", "p"], ["g"])
+        axes, origin, grip = _matrix(p[10:19]), p[19:22], p[22:27]
+        moment -= ca.cross(origin, force)
+        F, M = axes.T @ force, axes.T @ moment
+        loads = pad_loads(ca.vertsplit(F), ca.vertsplit(M), Pinch(grip[0], grip[1], grip[2], grip[3]))
+        rows = [load - (normal / grip[4]) ** 2 for load, normal in loads]
+        return ca.Function("hold", [q, v, p], [ca.vertcat(*rows, F[1] / grip[0])], ["q", "v", "p"], ["g"])
 
     function = _cached(robot, "hold", build)
-    limit = 1 / safety**2
-    parameters = _at_each(numbers, intervals)
-    upper = _bound(limit, closing_share)
-    return NodeConstraint("hold", function, parameters, _bound(-np.inf, -closing_share), upper, upper)
+    scale = _bound(1 / safety**2, 1 / safety**2, closing_share)
+    lower, upper = _bound(-np.inf, -np.inf, -closing_share), _bound(0.0, 0.0, closing_share)
+    return NodeConstraint("hold", function, _at_each(numbers, intervals), lower, upper, scale)
 
 
-def above_ground(robot: RobotModel, points: ArrayLike, intervals: int, depth: float = 1e-4) -> NodeConstraint:
-    """The carried part stays out of the ground: the corners of its underside have a height ≥ −depth.
+# The carried part is well above the ground after this part of the delivery, by LIFT_CLEARANCE (m): more than it sags in
+# the hand, so that it leaves the ground for good.
+LIFT_SHARE = 0.2
+LIFT_CLEARANCE = 0.003
+
+
+def above_ground(robot: RobotModel, points: ArrayLike, floor: ArrayLike) -> NodeConstraint:
+    """The carried part stays out of the ground: the corners of its underside keep above a floor.
 
     The paper has no such row; with time-optimal weights the part would dig an edge into the ground as it is lifted.
 
     Args:
         robot: The arm.
         points: (K, 3) corners in the flange frame (m).
-        intervals: N of the grid.
-        depth: Rounding allowed (m), > 0, because the part stands on the ground when it is taken.
+        floor: (N+1, K) least height of each corner at each grid point (m); see `lift_floor`.
     """
-    corners = _points(points)
+    corners, floor = _points(points), np.asarray(floor, dtype=float)
     count = len(corners)
+    if floor.ndim != 2 or floor.shape[1] != count:
+        raise InvalidProblem(f"a floor of shape (N+1, {count}) expected, got {floor.shape}")
 
     def build() -> ca.Function:
-        q, v, p = _inputs(robot, 3 * count)
+        q, v, p = _inputs(robot, 4 * count)
         R, position = symbolic.flange_pose(robot)(q)
-        heights = [position[2] + ca.dot(R[2, :].T, p[3 * i : 3 * i + 3]) for i in range(count)]
-        return ca.Function("above_ground", [q, v, p], [ca.vertcat(*heights)], ["q", "v", "p"], ["g"])
+        corner, level = ca.reshape(p[: 3 * count], 3, count), p[3 * count :]
+        rows = position[2] + (R[2, :] @ corner).T - level
+        return ca.Function("above_ground", [q, v, p], [rows], ["q", "v", "p"], ["g"])
 
     function = _cached(robot, f"above_ground_{count}", build)
-    lower, upper = np.full(count, -depth), np.full(count, np.inf)
+    parameters = np.hstack([_at_each(corners.ravel(), len(floor) - 1), floor])
     return NodeConstraint(
-        "above_ground", function, _at_each(corners.ravel(), intervals), lower, upper, np.full(count, 0.01)
+        "above_ground", function, parameters, np.zeros(count), np.full(count, np.inf), np.full(count, 0.01)
     )
 
 
-def holding_margin(part: pin.Inertia, T_world_grasp: pin.SE3, friction: Friction, pinch_force: float) -> float:
-    """By what factor the pinch exceeds what the part's weight asks of it, at rest.
+def lift_floor(start: ArrayLike, end: ArrayLike, intervals: int, depth: float = 1e-4) -> Array:
+    """Least heights of a part's corners over the delivery: from where they stand up to `LIFT_CLEARANCE`.
 
     Args:
-        part: Inertia of the part in the grasp frame.
-        T_world_grasp: The grasp frame, y along the closing axis.
-        friction: As in `hold`.
-        pinch_force: As in `hold` (N).
+        start: (K,) heights at the grasp (m); an estimate may put a standing part a little into the ground.
+        end: (K,) heights at the target (m).
+        intervals: N of the grid.
+        depth: Rounding allowed (m), > 0, so that a part that stands is not at the very edge of what is allowed.
 
-    Raises:
-        GraspRefused: 2 t N < 2 m g d with d the lever of the weight about the closing axis: the part would turn in the
-            hand at the slightest acceleration.
+    Returns:
+        (N+1, K) heights (m).
     """
-    weight = T_world_grasp.rotation.T @ np.array([0.0, 0.0, part.mass * pin.Model.gravity981[2]])
-    moment = float(np.cross(part.lever, weight)[1])
-    capacity = 2 * friction.torsional * pinch_force
-    if capacity < 2 * abs(moment):
-        raise GraspRefused(
-            f"the pinch holds {capacity:.3f} Nm of torsion; the part's weight asks {abs(moment):.3f} Nm about the "
-            f"closing axis, and twice that is needed"
-        )
-    slip, twist, _ = _inverse_capacities(friction, pinch_force)
-    return float(1 / np.hypot(slip * np.hypot(weight[0], weight[2]), twist * moment))
-
-
-def _inverse_capacities(friction: Friction, pinch_force: float) -> Array:
-    return 1 / (pinch_force * np.array([2 * friction.sliding, 2 * friction.torsional, 1.0]))
+    start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    risen = np.minimum(np.linspace(0.0, 1.0, intervals + 1) / LIFT_SHARE, 1.0)[:, None]
+    lowest = np.minimum(start, 0.0)
+    # A target on or in the ground is the user's wish; then the part only has to stay above both ends.
+    goal = LIFT_CLEARANCE if (end > LIFT_CLEARANCE).all() else min(float(end.min()), 0.0)
+    return lowest + risen * np.maximum(goal - lowest, 0.0) - depth
 
 
 def _in_grasp_frame(robot: RobotModel, q: ca.SX, p_G: ca.SX, frame: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -13,6 +13,7 @@ from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.grasp_object import Grasp, GraspObject
 from dyngrasp.models.gripper import GripperModel
 from dyngrasp.models.inverse_kinematics import InverseKinematics, inverse_kinematics_for, joint_velocity
+from dyngrasp.models.pinch import Pinch
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.signals import Array, read_only
 
@@ -36,6 +37,8 @@ class TaskSettings:
         over_close: How much narrower than the part the planned closed gap is (m), so that contact comes before the
             lift and the position loop already presses when the force ramp begins.
         side_clearance_min: Least free gap on either side of the part with the gripper open (m).
+        grip_share: Part of the finger force that the hand presses with; the rest is left to its position loop, which
+            keeps the part from moving sideways.
         holding_safety: Factor by which the pinch must exceed what the part asks of it (torsion and friction).
         lateral_tolerance, dip_tolerance: How far G may leave the grasp axis, and pass below the grasp frame, while the
             hand closes (m).
@@ -53,6 +56,7 @@ class TaskSettings:
     grasp_duration_max: float = 0.8
     over_close: float = 0.001
     side_clearance_min: float = 0.010
+    grip_share: float = 0.8
     holding_safety: float = 2.0
     lateral_tolerance: float = 0.0015
     dip_tolerance: float = 0.003
@@ -100,6 +104,11 @@ class GraspTask:
             loaded = self._carrying_gripper(closed).with_payload(T_flange_object.act(self.grasp_object.spatial_inertia))
             self._loaded[grasp] = loaded
         return self._loaded[grasp]
+
+    def pinch(self, grasp: Grasp) -> Pinch:
+        """How the hand presses on the part in `grasp`."""
+        friction, force = self.grasp_object.friction, self.settings.grip_share * self.gripper.pinch_force
+        return Pinch(force, friction.sliding, friction.torsional, grasp.width)
 
     def closed_posture(self, grasp: Grasp) -> Array:
         """(m,) posture of the gripper around the part, a little narrower than the part so that it presses.
@@ -308,13 +317,14 @@ def check_grasp(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> None:
     lever = T_world_object.act(part.centre_of_mass) - T_world_grasp.translation
     weight = part.mass * np.array([0.0, 0.0, -GRAVITY])
     moment = abs(float(T_world_grasp.rotation[:, 1] @ np.cross(lever, weight)))
-    capacity = 2 * part.friction.torsional * gripper.pinch_force
+    pinch = task.pinch(grasp)
+    capacity = 2 * pinch.torsional * pinch.force
     if capacity < settings.holding_safety * moment:
         raise GraspRefused(
             f"{gripper.name} holds {capacity:.3f} Nm of torsion on {part.name}; its weight asks {moment:.3f} Nm about "
             f"the pinch axis, and a safety factor of {settings.holding_safety:g} is required"
         )
-    grip = 2 * part.friction.sliding * gripper.pinch_force
+    grip = 2 * pinch.sliding * pinch.force
     if grip < settings.holding_safety * part.mass * GRAVITY:
         raise GraspRefused(
             f"{gripper.name} carries {grip:.1f} N by friction; {part.name} weighs {part.mass * GRAVITY:.1f} N, and a "
