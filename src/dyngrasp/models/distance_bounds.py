@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import coal
+import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
