@@ -68,40 +68,44 @@ def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -
 
 
 @njit(cache=True, error_model="numpy")
-def sequence(x: Array, T: float, ends: Array, hold_start: bool, hold_end: bool, r: Array) -> None:
-    """Write r (N+3, n) from the unknowns x (N−1, n), T and `ends` (2, 3, n): position, velocity, acceleration at both."""
-    size, n = x.shape
-    N = size + 1
-    h = 1.0 / N
-    for i in range(1, size - 1):
-        for j in range(n):
-            r[i + 2, j] = x[i, j]
-    for j in range(n):
-        r0, rN = x[0, j], x[size - 1, j]
-        if hold_start:
-            r0 = ends[0, 0, j] - h * h * T * T * ends[0, 2, j] / 4
-        if hold_end:
-            rN = ends[1, 0, j] - h * h * T * T * ends[1, 2, j] / 4
-        r[1, j], r[N + 1, j] = r0, rN
-        r[0, j] = 2 * ends[0, 0, j] - r0 - h * T * ends[0, 1, j]
-        r[2, j] = 2 * ends[0, 0, j] - r0 + h * T * ends[0, 1, j]
-        r[N, j] = 2 * ends[1, 0, j] - rN - h * T * ends[1, 1, j]
-        r[N + 2, j] = 2 * ends[1, 0, j] - rN + h * T * ends[1, 1, j]
+def boundary(T: float, T_ref: float, ends: Array, reference: Array, linear: bool, values: Array, slopes: Array) -> None:
+    """Write q, w, a at both ends and their derivatives by T, both (2, 3, n).
+
+    Exactly they are q, T q̇, T² q̈ of `ends` (2, 3, n). The paper's program knows them to first order about the reference
+    (3, N+1, n): T* q̇ + q̇* (T − T*) and T*² q̈ + 2 T* v* (T − T*).
+    """
+    for end in range(2):
+        k = 0 if end == 0 else reference.shape[1] - 1
+        for j in range(ends.shape[2]):
+            q, rate, curvature = ends[end, 0, j], ends[end, 1, j], ends[end, 2, j]
+            values[end, 0, j], slopes[end, 0, j] = q, 0.0
+            if linear:
+                slopes[end, 1, j] = reference[1, k, j]
+                slopes[end, 2, j] = 2 * T_ref * reference[2, k, j]
+                values[end, 1, j] = T_ref * rate + slopes[end, 1, j] * (T - T_ref)
+                values[end, 2, j] = T_ref * T_ref * curvature + slopes[end, 2, j] * (T - T_ref)
+            else:
+                values[end, 1, j], slopes[end, 1, j] = T * rate, rate
+                values[end, 2, j], slopes[end, 2, j] = T * T * curvature, 2 * T * curvature
 
 
 @njit(cache=True, error_model="numpy")
-def sequence_by_duration(T: float, ends: Array, hold_start: bool, hold_end: bool, r: Array) -> None:
-    """Write ∂r/∂T (N+3, n) at constant x: zero but at three places at either end."""
-    points, n = r.shape
-    N = points - 3
-    h = 1.0 / N
-    r[:] = 0.0
-    for j in range(n):
-        d0 = -h * h * T * ends[0, 2, j] / 2 if hold_start else 0.0
-        dN = -h * h * T * ends[1, 2, j] / 2 if hold_end else 0.0
-        r[1, j], r[N + 1, j] = d0, dN
-        r[0, j], r[2, j] = -d0 - h * ends[0, 1, j], -d0 + h * ends[0, 1, j]
-        r[N, j], r[N + 2, j] = -dN - h * ends[1, 1, j], -dN + h * ends[1, 1, j]
+def sequence(x: Array, values: Array, held: tuple[bool, bool], r: Array) -> None:
+    """Write r (N+3, n) from the unknowns x (N−1, n) and q, w, a at both ends (2, 3, n)."""
+    size, n = x.shape
+    h = 1.0 / (size + 1)
+    for i in range(1, size - 1):
+        for j in range(n):
+            r[i + 2, j] = x[i, j]
+    for end in range(2):
+        at = 1 if end == 0 else size + 2
+        for j in range(n):
+            middle = x[0, j] if end == 0 else x[size - 1, j]
+            if held[end]:
+                middle = values[end, 0, j] - h * h * values[end, 2, j] / 4
+            r[at, j] = middle
+            r[at - 1, j] = 2 * values[end, 0, j] - middle - h * values[end, 1, j]
+            r[at + 1, j] = 2 * values[end, 0, j] - middle + h * values[end, 1, j]
 
 
 @njit(cache=True, error_model="numpy")

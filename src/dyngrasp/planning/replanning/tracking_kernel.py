@@ -8,13 +8,13 @@ from numba import njit
 from dyngrasp.planning.replanning.box_rows import INFEASIBLE, OPTIMAL, UNBOUNDED, collect, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
+    boundary,
     factorise,
     filtered,
     product,
     pull_back,
     push_forward,
     sequence,
-    sequence_by_duration,
     substitute,
     weigh,
 )
@@ -103,7 +103,8 @@ def solve(
     band = base.copy()
     factorise(band)
 
-    x, r = np.empty((size, n)), np.empty((K + 2, n))
+    x, r, nothing = np.empty((size, n)), np.empty((K + 2, n)), np.zeros((size, n))
+    values, slopes = np.empty((2, 3, n)), np.empty((2, 3, n))
     h2 = 1.0 / (K - 1) ** 2
     for i in range(size):
         k = 0 if i == 0 else (K - 1 if i == size - 1 else i + 1)
@@ -121,9 +122,11 @@ def solve(
     passes = 2 if moving_ends and free_T and not paper_rows else 1
     for _ in range(passes):
         T_lin = T
-        sequence(x, T, ends, held[0], held[1], r)
+        boundary(T, T_ref, ends, reference, paper_rows, values, slopes)
+        sequence(x, values, held, r)
         filtered(r, z)
-        sequence_by_duration(T, ends, held[0], held[1], r)
+        # The sequence is linear: at constant x it changes with T as it would from slopes at the ends and x = 0.
+        sequence(nothing, slopes, held, r)
         filtered(r, slope)
         corner, gradient_T = stiffness_T, stiffness_T * (T - T_ref)
         g_T = gradient_T
@@ -236,6 +239,7 @@ def solve(
         count = 0
         multipliers[:] = 0.0
     if not paper_rows:
-        sequence(x, T, ends, held[0], held[1], r)
+        boundary(T, T_ref, ends, reference, False, values, slopes)
+        sequence(x, values, held, r)
         filtered(r, z)
     return outcome, T, iterations, count

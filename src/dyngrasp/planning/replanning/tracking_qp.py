@@ -62,8 +62,8 @@ class TrackingProblem:
         velocity_limit, acceleration_limit: (n,) limits, +inf where there is none.
         min_duration, max_duration: Bounds of ΔT (s), 0 < min ≤ max < ∞; equal ones fix it.
         weights: Of the deviations.
-        paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the answer then is the linear model of the
-            motion, with a trajectory that has the defect of eq. (15).
+        paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the motion then is that of the paper's
+            update (15), with its defect.
         node_weights: (N+1,) added to Q_q at each grid point, where the motion has to stay with the reference; none if left out.
     """
 
@@ -99,7 +99,7 @@ class TrackingSolution:
     Attributes:
         status: `converged`, or why not.
         duration: ΔT (s).
-        scaled: (3, N+1, n) q (rad), w = T q̇ and a = T² q̈ (rad).
+        scaled: (3, N+1, n) q (rad), w = T q̇ and a = T² q̈ (rad); with `paper_rows` their linear model.
         iterations: Of the interior point method; 0 where no box is active.
         rows: Codes of the rows that were imposed, see `box_rows`.
         multipliers: Their multipliers and those of the two bounds of ΔT.
@@ -116,6 +116,8 @@ class TrackingSolution:
 
     def trajectory(self, problem: TrackingProblem) -> Trajectory:
         """The motion in real time, its boundary states those of the problem to the last digit."""
+        if problem.paper_rows:
+            return paper_update(problem.reference, paper_step(problem, self))
         T = self.duration
         position = self.scaled[0].copy()
         velocity, acceleration = self.scaled[1] / T, self.scaled[2] / T**2
@@ -191,4 +193,26 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 40) -> Tracki
     elapsed = 1e3 * (time.perf_counter() - began)
     return TrackingSolution(
         status, duration, scaled, iterations, codes[:count].copy(), multipliers[: count + 2].copy(), elapsed
+    )
+
+
+def paper_step(problem: TrackingProblem, solution: TrackingSolution) -> Array:
+    """(N+1, 3n+1) stages s_k = [δq, δq̇, δv, δT] of a solution: the same minimiser in the paper's variables."""
+    reference, T = problem.reference, problem.reference.duration
+    dT = solution.duration - T
+    q, w, a = solution.scaled
+    dq = q - reference.position
+    dw = (w - (T + dT) * reference.velocity) / T
+    dv = (a - (T * T + 2 * T * dT) * reference.acceleration) / T**2
+    return np.hstack([dq, dw, dv, np.full((len(q), 1), dT)])
+
+
+def paper_update(reference: Trajectory, step: Array) -> Trajectory:
+    """ξ* + δξ*, eq. (15). The products of deviations that it drops leave a defect in the dynamics."""
+    n = reference.position.shape[1]
+    return Trajectory(
+        reference.duration + float(step[0, -1]),
+        reference.position + step[:, :n],
+        reference.velocity + step[:, n : 2 * n],
+        reference.acceleration + step[:, 2 * n : 3 * n],
     )
