@@ -27,7 +27,7 @@ def matrix(size: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("size", "width"), [(1, 1), (6, 9), (21, 21), (40, 3), (150, 21), (231, 24)])
 def test_factor_is_lapacks(size, width):
-    dense, band = matrix(size, min(width, size), size)
+    _, band = matrix(size, min(width, size), size)
     expected = cholesky_banded(band.T, lower=True)
     wide = np.zeros((size, width))
     wide[:, : band.shape[1]] = band

@@ -97,9 +97,14 @@ class InteriorPoint:
             rows.start_near(self.g, self.mu, self.price, multipliers, self.s, self.t, self.multiplier)
         for iteration in range(settings.max_iterations + 1):
             objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
-            violation = max(0.0, -float(self.g.min()))
+            violation = -float(self.g.min())
             if not np.isfinite(objective + violation):
+                if self.free and self.history:
+                    self._leave_free_mode()
+                    self._undo_step()
+                    continue
                 return Outcome.NONFINITE, self.best, iteration
+            violation = max(0.0, violation)
             self.best.offer(self.x, self.T, objective, violation, settings.violation_tolerance)
             feasible = violation <= settings.violation_tolerance
             if model.factor == 0.0 and feasible:
@@ -172,11 +177,14 @@ class InteriorPoint:
         if not self.free:
             return True
         if error > FALL * max(self.history[-MEMORY:], default=np.inf):
-            self.free, self.reference, self.mu = False, ENOUGH * self.history[-1], 0.8 * self.mean
+            self._leave_free_mode()
             return False
         self.history.append(error)
         self.mean = mean
         return True
+
+    def _leave_free_mode(self) -> None:
+        self.free, self.reference, self.mu = False, ENOUGH * self.history[-1], 0.8 * self.mean
 
     def _undo_step(self) -> None:
         """Back to where the last free step began; the arrays of the new point still hold that point."""

@@ -111,7 +111,7 @@ class LimitRows:
         return boxes + self.lower_index.size + self.upper_index.size
 
     def violation(self, g: Array, T: float) -> tuple[float, str]:
-        """Largest violation among the rows g (K · R + 2,), in units of each limit, and its kind; (0, "") if none.
+        """Largest violation among the rows g (K · R + 2,), in units of each limit, and its name; (0, "") if none.
 
         Args:
             g: Rows from `row_values`.
@@ -123,6 +123,8 @@ class LimitRows:
         least[4 * n : 4 * n + accelerations] /= T**2
         least = np.append(least, g[-2:].min())
         worst = int(least.argmin())
+        if not np.isfinite(least[worst]):
+            return np.inf, self.names[worst]
         return (-float(least[worst]), self.names[worst]) if least[worst] < 0 else (0.0, "")
 
     @property

@@ -1,7 +1,8 @@
 """Rows of a `NodeConstraint`, their Jacobian and the Hessian of their weighted sum at all grid points, compiled.
 
 The derivatives are taken symbolically of one grid point; the C code that CasADi makes of them is compiled once for
-each arm and row and runs over the grid in a loop. Without a C compiler CasADi's virtual machine evaluates the same expressions.
+each arm and row and runs over the grid in a loop. Without a C compiler CasADi's virtual machine evaluates the same
+expressions.
 """
 
 from __future__ import annotations
