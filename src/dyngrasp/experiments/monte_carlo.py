@@ -22,6 +22,7 @@ from dyngrasp.experiments.scenario import Scenario
 from dyngrasp.experiments.statistics import Proportion, timing_summary, wilson
 from dyngrasp.experiments.trial import planner_for, study_row
 from dyngrasp.experiments.workcell import load_workcell
+from dyngrasp.models.model_file import decode
 
 _COLUMNS = {
     "trial": pa.int64(),
@@ -148,7 +149,7 @@ def _rows(
     pending = set(indices)
     while pending:
         # spawn: a fork would copy the threads' locks of the libraries that have been imported here.
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (scenario, source))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (scenario.model_dump(mode="json"), source))
         futures: dict[Future[dict[str, Any]], int] = {
             pool.submit(_run, trial_seed(seed, i)): i for i in sorted(pending)
         }
@@ -177,10 +178,10 @@ def _rows(
 _worker: dict[str, Any] = {}
 
 
-def _begin(scenario: Scenario, source: str) -> None:
+def _begin(scenario: dict[str, Any], source: str) -> None:
     # Ctrl-C reaches the whole process group; the parent decides what happens then.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _worker["workcell"] = load_workcell(scenario, source)
+    _worker["workcell"] = load_workcell(decode(Scenario, scenario, source), source)
     _worker["planner"] = planner_for(_worker["workcell"])
 
 

@@ -283,8 +283,8 @@ class CollocationPlanner:
     def _above_ground(self, targets: GraspTargets) -> NodeConstraint:
         T, corners = self._T_flange_object(targets), self.task.grasp_object.underside
         place = self.task.robot.forward_kinematics(targets.place.position) * T
-        start, end = ((pose.act(corner)[2] for corner in corners) for pose in (targets.T_world_object, place))
-        floor = constraints.lift_floor(list(start), list(end), self.settings.intervals)
+        start, end = (pose.translation[2] + corners @ pose.rotation[2] for pose in (targets.T_world_object, place))
+        floor = constraints.lift_floor(start, end, self.settings.intervals)
         return constraints.above_ground(self.task.robot, corners @ T.rotation.T + T.translation, floor)
 
     def _T_flange_object(self, targets: GraspTargets) -> pin.SE3:
