@@ -85,20 +85,21 @@ def _models(task: GraspTask, grasp_name: str) -> _Models:
     return _Models(task, grasp_name)
 
 
-def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditReport:
+def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float = -np.inf) -> AuditReport:
     """Evaluate every constraint of a plan.
 
     Args:
         plan: Any plan, whoever made it.
         targets: The boundary states and the grasp that it was made for.
         task: Arm, gripper, part and settings.
+        since: What comes before this time (s) is past and not looked at; at the latest the end of the grasp.
 
     Returns:
         One entry a constraint, each with the worst value, its bound and its time. A plan that fails one must not be
         executed.
     """
     models = _models(task, targets.grasp.name)
-    samples = _sample(plan)
+    samples = _sample(plan, since)
     approach, grasp, deliver = samples.phases
     torques, _ = models.empty.inverse_dynamics(*(x[: grasp.stop] for x in (samples.q, samples.w, samples.v)))
     loaded, motion = models.loaded.inverse_dynamics(*(x[deliver] for x in (samples.q, samples.w, samples.v)))
@@ -107,7 +108,7 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditRepor
     entries = [
         _dynamics(plan),
         *_joins(plan),
-        *_boundaries(plan, targets, task, models),
+        *_boundaries(plan, targets, task, models, since),
         *_box_entries(samples, plan, task),
         _at_most(
             "torque",
@@ -118,7 +119,7 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditRepor
             "of limit",
             plan.arm_joints,
         ),
-        _funnel(G[approach], samples.times[approach], task),
+        *_funnel(G[approach], samples.times[approach], task),
         *_reversal(G[grasp], angles[grasp], samples.times[grasp], task),
         _hold(motion, samples.times[deliver], targets, task, models),
         *clearance_entries(
@@ -133,10 +134,11 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditRepor
     return AuditReport(tuple(entries))
 
 
-def _sample(plan: GraspPlan) -> _Samples:
+def _sample(plan: GraspPlan, since: float) -> _Samples:
     tables, phases, end = [], [], 0
     for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends, strict=True):
-        local = np.linspace(0.0, arm.duration, SUBSTEPS * max(arm.intervals, gripper.intervals) + 1)
+        count = SUBSTEPS * max(arm.intervals, gripper.intervals) + 1
+        local = np.linspace(max(since - (T - arm.duration), 0.0), arm.duration, count if since < T else 0)
         tables.append((T - arm.duration + local, *arm.sample_many(local), *gripper.sample_many(local)))
         phases.append(slice(end, end + local.size))
         end += local.size
@@ -190,7 +192,9 @@ def _neighbours(phases: tuple[Trajectory, ...]) -> list[tuple[Trajectory, Trajec
     return list(itertools.pairwise(phases))
 
 
-def _boundaries(plan: GraspPlan, targets: GraspTargets, task: GraspTask, models: _Models) -> list[AuditEntry]:
+def _boundaries(
+    plan: GraspPlan, targets: GraspTargets, task: GraspTask, models: _Models, since: float
+) -> list[AuditEntry]:
     """Where the hand really is at T_1, T_2, T_3, from the plan's joints alone, against where it was sent."""
     ends = [phase.position[-1] for phase in plan.arm]
     fingers = [phase.position[-1] for phase in plan.gripper]
@@ -204,6 +208,8 @@ def _boundaries(plan: GraspPlan, targets: GraspTargets, task: GraspTask, models:
     )
     entries = []
     for time, (name, offset, angle) in zip(plan.phase_ends.tolist(), errors, strict=True):
+        if time < since:
+            continue
         distance = float(np.linalg.norm(offset))
         entries.append(AuditEntry(f"{name}_position", distance, 0.0, False, LENGTH_TOLERANCE, "m", time))
         entries.append(AuditEntry(f"{name}_angle", float(angle), 0.0, False, 1e-5, "rad", time))
@@ -253,12 +259,14 @@ def _off_centre(q: Array, lower: Array, upper: Array) -> Array:
     return np.abs(q - (upper + lower) / 2) / ((upper - lower) / 2)
 
 
-def _funnel(G: Array, times: Array, task: GraspTask) -> AuditEntry:
+def _funnel(G: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
     """h(q) of eq. (7): the height of G (M, 3) in the grasp frame above the inverted Gaussian of eq. (6)."""
+    if not times.size:
+        return []
     funnel = task.grasp_object.funnel
     x, y, z = G.T
     bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
-    return _at_least("funnel", z - funnel.z_threshold * (1.0 - bell), times, 0.0, CHORD_TOLERANCE, "m")
+    return [_at_least("funnel", z - funnel.z_threshold * (1.0 - bell), times, 0.0, CHORD_TOLERANCE, "m")]
 
 
 def _reversal(G: Array, angles: Array, times: Array, task: GraspTask) -> list[AuditEntry]:

@@ -322,6 +322,8 @@ def _carried(cell: CellGeometry, scene: Scene, seen: Tracks) -> Candidates:
 def _spread(q: Array) -> Indices:
     """Indices of samples of q (M, n), first and last included, `JOINT_STEP` apart or less if the samples allow it."""
     chosen = np.empty(q.shape[0], np.int64)
+    if q.shape[0] == 0:
+        return chosen
     chosen[0], used = 0, 1
     for k in range(1, q.shape[0]):
         keep = k == q.shape[0] - 1

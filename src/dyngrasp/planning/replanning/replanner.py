@@ -267,7 +267,7 @@ class _Attempt:
 
     def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
         started = self.clock()
-        report = audit(plan, targets, self.task)
+        report = audit(plan, targets, self.task, self.splice)
         if self.recovery is not None and plan.start_time == self.splice:
             report = self.recovery.judge(report, plan, targets, self.task)
         self._count("audit", started)
