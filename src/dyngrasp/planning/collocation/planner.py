@@ -16,6 +16,7 @@ from dyngrasp.planning.collocation.closed_form import optimum_through
 from dyngrasp.planning.collocation.gripper_path import GripperPath, gripper_path
 from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
 from dyngrasp.planning.collocation.residuals import rows
+from dyngrasp.planning.collocation.structured import StructuredSettings, StructuredSolver
 from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask
 from dyngrasp.planning.problem import NodeConstraint, PhaseProblem, PhaseSolver, PlanResult, Solution, Status
 from dyngrasp.signals import Array, JointState
@@ -41,7 +42,7 @@ class CollocationSettings:
 
     effort_weight: float = 1.0
     intervals: int = 100
-    backend: str = "ipopt"
+    backend: str = "structured"
     velocity_fraction: float = 0.95
     torque_fraction: float = 0.9
     position_margin: float = 0.01
@@ -57,7 +58,7 @@ class CollocationSettings:
             raise InvalidProblem(f"no backend called {self.backend!r}; valid: {', '.join(sorted(BACKENDS))}")
 
 
-BACKENDS = {"ipopt": lambda: IpoptSolver(IpoptSettings())}
+BACKENDS = {"structured": lambda: StructuredSolver(StructuredSettings()), "ipopt": lambda: IpoptSolver(IpoptSettings())}
 """Solvers of one phase by name."""
 
 # Heights of the way points between the pre-grasp (0) and z_th (1), and so when they are passed before the end.
