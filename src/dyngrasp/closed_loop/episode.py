@@ -8,6 +8,7 @@ from typing import Any
 
 from dyngrasp.closed_loop.clock import Clock
 from dyngrasp.closed_loop.record import EpisodeRecord, Recorder
+from dyngrasp.closed_loop.replanning_loop import ReplanningLoop
 from dyngrasp.control.computed_torque import ComputedTorque, ComputedTorqueSettings
 from dyngrasp.control.grasp_controller import Controller, GraspController
 from dyngrasp.control.gripper_control import GripperController, GripperControlSettings
@@ -26,11 +27,13 @@ class EpisodeSettings:
         control_period: Of controllers and plant (s). 1 ms; the paper's 125 µs works as well.
         hold_time: How long the arm holds the part at the target before the episode ends (s): slow slip shows there.
         record_rate: Samples a second in the record (Hz); contacts between samples are not lost.
+        longest_delay: How much later than the first plan the last one may end (s).
     """
 
     control_period: float = 1e-3
     hold_time: float = 0.5
     record_rate: float = 250.0
+    longest_delay: float = 30.0
 
 
 def grasp_controller(
@@ -64,10 +67,11 @@ def run_episode(
     controller: Controller,
     settings: EpisodeSettings | None = None,
     *,
+    replanning: ReplanningLoop | None = None,
     progress: Callable[[float, str], None] | None = None,
     meta: dict[str, Any] | None = None,
 ) -> EpisodeRecord:
-    """Carry out a plan.
+    """Carry out a plan, or the plans that follow from it.
 
     The controllers see observations and the plan; the truth goes into the record and nowhere else.
 
@@ -76,6 +80,7 @@ def run_episode(
         plant: Where it happens; its time must be the plan's start, its period the control period.
         controller: Turns both into torques.
         settings: Rates.
+        replanning: Replaces the plan as the pose of the part becomes known; begins with the same plan.
         progress: Called at every recorded sample with the time (s) and the name of the phase.
         meta: Kept with the record.
 
@@ -83,8 +88,15 @@ def run_episode(
         InvalidProblem: Plant and clock disagree about the time.
     """
     settings = settings or EpisodeSettings()
+    rate = 0.0 if replanning is None else replanning.settings.rate
+    # Replans change the end of the motion; the longest time bounds an episode whose plans never end.
+    longest = settings.hold_time + (0.0 if replanning is None else settings.longest_delay)
     clock = Clock(
-        settings.control_period, plan.start_time, plan.end_time + settings.hold_time, record_rate=settings.record_rate
+        settings.control_period,
+        plan.start_time,
+        plan.end_time + longest,
+        replan_rate=rate,
+        record_rate=settings.record_rate,
     )
     recorder = Recorder(plan.arm_joints, plan.gripper_joints, settings.control_period)
     for tick in clock:
@@ -94,10 +106,13 @@ def run_episode(
                 f"episode: the plant is at {observed.t:.6f} s, the clock at {tick.t:.6f} s; the plant's step must be "
                 f"the control period of {settings.control_period:g} s and its start that of the plan"
             )
-        # Between observing and sampling the plan is where a pose source and a replanner take their turn.
+        truth, state = plant.truth(), plant.state
+        if replanning is not None:
+            plan = replanning.plan_at(tick.t, tick.replan, truth)
+            if tick.t >= replanning.newest.end_time + settings.hold_time:
+                break
         sample = plan.sample(tick.t)
         command = controller.command(observed, sample)
-        truth, state = plant.truth(), plant.state
         recorder.watch(observed, truth)
         plant.step(command)
         if tick.record:

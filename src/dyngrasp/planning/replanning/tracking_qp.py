@@ -141,7 +141,7 @@ _STATUS = {
 _DURATION_SLACK = 1e-12  # an interval of durations narrower than this is a point
 
 
-def solve_tracking(problem: TrackingProblem, max_iterations: int = 40) -> TrackingSolution:
+def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> TrackingSolution:
     """Solve the program; never raises for numerical reasons.
 
     Args:
