@@ -1,7 +1,8 @@
 """Replanning while the arm moves: when it starts, when its answer is there, and when a new plan takes over.
 
-An answer becomes available a latency after its question, measured or fixed; what is not there by its splice is late and dropped. A new
-question waits until the answer to the former is there, so that every plan continues the one that will really run before it.
+An answer becomes available a latency after its question, measured or fixed; what is not there by its splice is late
+and dropped. A new question waits until the answer to the former is there, so that every plan continues the one that
+will really run before it.
 """
 
 from __future__ import annotations
@@ -119,6 +120,7 @@ class ReplanningLoop:
             return
         self._asked = None
         self.events.append(event)
-        # A control period may lie between the splice and this tick: the old plan was followed until then, and both agree there.
+        # A control period may lie between the splice and this tick: the old plan was followed until then, and both
+        # agree there.
         if event.result.ok and not event.late:
             self._next, self._targets = event.result.plan, event.result.targets

@@ -1,7 +1,7 @@
 """Pose estimates without a camera: the truth with the error that a camera on the hand would leave, smaller as it nears.
 
-At first the part is believed to be where somebody said; what was wrong with that is revealed linearly with the distance between hand and
-part, down to an error that stays, as calibration leaves it, and noise from frame to frame.
+At first the part is believed to be where somebody said; what was wrong with that is revealed linearly with the
+distance between hand and part, down to an error that stays, as calibration leaves it, and noise from frame to frame.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The boxes of the tracking program as one-sided rows g ≥ 0, and the interior point method on those that matter.
 
-Only rows near their bound are handed to the method: of some 2800 a phase about twenty are ever active. A row is named by a code,
+Only rows near their bound are handed to the method: of some 2800 a phase about twenty are ever active. A row is named
+by a code,
 
     code = ((kind · 2 + side) · K + k) · n + joint,   kind 0 … 2 for q, w, a; side 0 upper, 1 lower;
 
@@ -37,12 +38,13 @@ def bound(
 
     Args:
         kind: 0 … 2 for q, w, a.
-        k, j: Grid point and joint.
+        k: Grid point.
+        j: Joint.
         sign: +1 for the upper side, −1 for the lower one.
         T_lin: Duration about which rows are linear (s).
         boxes: (4, n) q_min, q_max, q̇_max, v_max.
-        rates: (2, K, n) sides of the paper's boxes: how w and a change with T at constant q̇ and v; or (2, 0, n) for the
-            exact rows |w| ≤ T q̇_max, |a| ≤ T_lin² v_max + 2 T_lin v_max (T − T_lin) ≤ T² v_max.
+        rates: (2, K, n) sides of the paper's boxes: how w and a change with T at constant q̇ and v; or (2, 0, n) for
+            the exact rows |w| ≤ T q̇_max, |a| ≤ T_lin² v_max + 2 T_lin v_max (T − T_lin) ≤ T² v_max.
     """
     if kind == 0:
         scale = 2.0 / (boxes[1, j] - boxes[0, j])
@@ -60,7 +62,7 @@ def bound(
 def collect(
     z: Array, T: float, T_lin: float, boxes: Array, rates: Array, margin: float, a_ends: tuple[bool, bool], codes: Array
 ) -> tuple[int, float]:
-    """Write the codes of all rows closer to their bound than `margin`; return how many and the least value of any row."""
+    """Write the codes of the rows closer to their bound than `margin`; return their number and the least row of all."""
     _, K, n = z.shape
     count, least = 0, np.inf
     shift = T - T_lin
@@ -114,7 +116,8 @@ def interior_point(
 
     Args:
         codes: Rows to impose; those of T are always imposed where T is free.
-        first, taps: Of `filters`.
+        first: Of `filters`.
+        taps: Of `filters`.
         base: (N−1, 3, n) band of the Hessian of the cost.
         weights: (3, n) weights of q, w, a in the cost.
         node_weights: (K,) added to the weight of q at each grid point.
@@ -127,7 +130,8 @@ def interior_point(
         T: At the start (s).
         T_lin: Where the rows are linear (s).
         z: (3, K, n) q, w, a at the start, changed along.
-        boxes, rates: See `bound`.
+        boxes: See `bound`.
+        rates: See `bound`.
         duration: Bounds of T (s).
         free_T: Whether T is a variable.
         ends_cost: Whether the cost counts both end points.

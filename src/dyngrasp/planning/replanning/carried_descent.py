@@ -1,12 +1,12 @@
 """Where the funnel is narrow the hand repeats its old motion relative to the part.
 
-The quadratic program knows nothing of the funnel. But the old motion came down inside the old funnel, and carried along rigidly with the
-part it comes down inside the new one. So below the height z_th, where the funnel's wall begins, the reference of the
-program is the carried motion and its positions have weight; above, the correction is free to spread. Eq. (13) has weights Q_k that may
-differ from grid point to grid point.
+The quadratic program knows nothing of the funnel. But the old motion came down inside the old funnel, and carried
+along rigidly with the part it comes down inside the new one. So below the height z_th, where the funnel's wall
+begins, the reference of the program is the carried motion and its positions have weight; above, the correction is
+free to spread. Eq. (13) has weights Q_k that may differ from grid point to grid point.
 
-The carried motion is solved for at a few grid points by inverse kinematics of the same branch and arm angle; between them its difference
-to the old motion is a polynomial.
+The carried motion is solved for at a few grid points by inverse kinematics of the same branch and arm angle; between
+them its difference to the old motion is a polynomial.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ class DescentSettings:
     Attributes:
         height: The descent begins where G is at this multiple of z_th above the grasp frame.
         earliest: Part of the rest of the approach that is left free at least: a correction needs its time.
-        stiffness: Rate of the tracking, in multiples of one over the time of the descent: Q_q = (stiffness / time)⁴ Q_v.
+        stiffness: Rate of the tracking, in multiples of one over the time of the descent: Q_q = (stiffness / time)⁴
+            Q_v.
     """
 
     height: float = 1.05

@@ -1,7 +1,7 @@
-"""Where the quadratic program does not do: the phases under all constraints, torque and funnel included, by a solver of whole phases.
+"""Where the quadratic program does not do: whole phases under all constraints, torque and funnel included.
 
-Planner and solver are given from outside; this module asks for the problems from the moving start, softens the funnel by the stated rule,
-solves, and joins the answers to the running plan with the acceleration that it has at the splice.
+Planner and solver are given from outside; this module asks for the problems from the moving start, softens the funnel
+by the stated rule, solves, and joins the answers to the running plan with the acceleration that it has at the splice.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class FullProblem:
         planner: States the problems.
         solver: Solves one.
         settings: For the acceleration at the splice.
-        detour: How much longer than what was left of it the approach may become (s). On a grid stretched over a long detour the
-            steps would be coarse enough to pass through the funnel's wall unseen.
+        detour: How much longer than what was left of it the approach may become (s). On a grid stretched over a long
+            detour the steps would be coarse enough to pass through the funnel's wall unseen.
     """
 
     task: GraspTask
@@ -57,7 +57,7 @@ class FullProblem:
     def problems(
         self, state: PlanSample, left: float, targets: GraspTargets, recovery: FunnelRecovery
     ) -> tuple[tuple[PhaseProblem, ...] | None, str]:
-        """The problems from a state of the running plan with `left` (s) of its approach, or None and why there are none."""
+        """The problems from a state with `left` (s) of the approach ahead, or None and why there are none."""
         try:
             problems = self.planner.phase_problems(state.arm, targets, state.gripper.position)
         except DyngraspError as error:

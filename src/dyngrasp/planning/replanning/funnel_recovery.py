@@ -1,11 +1,12 @@
 """What becomes of the funnel when a new pose leaves the present state outside of it.
 
-Rule: over the rest of the approach, s from 0 at the splice to 1 at the pre-grasp, the height of the funnel's wall is multiplied by
+Rule: over the rest of the approach, s from 0 at the splice to 1 at the pre-grasp, the height of the funnel's wall is
+multiplied by
 
     φ(s) = min(1, φ_0 + (1 − φ_0) s / σ),
 
-where φ_0 ≤ 1 is the largest factor that leaves the hand inside at the splice, and σ < 1 a given share. A state inside the funnel has φ_0 = 1, and
-nothing is softened. Below the grasp frame no factor helps: such a state is refused.
+where φ_0 ≤ 1 is the largest factor that leaves the hand inside at the splice, and σ < 1 a given share. A state inside
+the funnel has φ_0 = 1, and nothing is softened. Below the grasp frame no factor helps: such a state is refused.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ filters of a sequence r[−1 … N+1],
 
     q[k] = (r[k−1] + 2 r[k] + r[k+1]) / 4,   w[k] = (r[k+1] − r[k−1]) / (2 h),   a[k] = (r[k+1] − 2 r[k] + r[k−1]) / h².
 
-Position and velocity at an end fix the two neighbours of r[0] (of r[N]) by r[±1] = 2 q − r[0] ± h T q̇. Where the acceleration is
-given as well, as at a splice, it fixes r[0] = q − h² T² q̈ / 4 too. The unknowns are x = (r[0], r[2], …, r[N−2], r[N]),
-N − 1 a joint, of which the first or the last may be held.
+Position and velocity at an end fix the two neighbours of r[0] (of r[N]) by r[±1] = 2 q − r[0] ± h T q̇. Where the
+acceleration is given as well, as at a splice, it fixes r[0] = q − h² T² q̈ / 4 too. The unknowns are x = (r[0], r[2],
+…, r[N−2], r[N]), N − 1 a joint, of which the first or the last may be held.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -
 
     Args:
         intervals: N ≥ 4.
-        hold_start, hold_end: Whether r[0] and r[N] are given.
+        hold_start: Whether r[0] is given.
+        hold_end: Whether r[N] is given.
         ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
 
     Returns:
-        `first` (N+1,), index of the first unknown of a grid point; `taps` (N+1, 3, 3), coefficients [k, tap, q/w/a] with zeros
-        at held unknowns; `bands` (3, N−1, 3), lower bands [q/w/a, column, diagonal] of Σ_k tap tapᵀ.
+        `first` (N+1,), index of the first unknown of a grid point; `taps` (N+1, 3, 3), coefficients [k, tap, q/w/a]
+        with zeros at held unknowns; `bands` (3, N−1, 3), lower bands [q/w/a, column, diagonal] of Σ_k tap tapᵀ.
     """
     N, h = intervals, 1.0 / intervals
     size = N - 1
@@ -71,8 +72,8 @@ def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -
 def boundary(T: float, T_ref: float, ends: Array, reference: Array, linear: bool, values: Array, slopes: Array) -> None:
     """Write q, w, a at both ends and their derivatives by T, both (2, 3, n).
 
-    Exactly they are q, T q̇, T² q̈ of `ends` (2, 3, n). The paper's program knows them to first order about the reference
-    (3, N+1, n): T* q̇ + q̇* (T − T*) and T*² q̈ + 2 T* v* (T − T*).
+    Exactly they are q, T q̇, T² q̈ of `ends` (2, 3, n). The paper's program knows them to first order about the
+    reference (3, N+1, n): T* q̇ + q̇* (T − T*) and T*² q̈ + 2 T* v* (T − T*).
     """
     for end in range(2):
         k = 0 if end == 0 else reference.shape[1] - 1
@@ -151,7 +152,7 @@ def push_forward(first: Array, taps: Array, dx: Array, z: Array) -> None:
 
 @njit(cache=True, error_model="numpy")
 def weigh(z: Array, weights: Array, node_weights: Array, k_first: int, k_last: int, dual: Array) -> None:
-    """Write Q z into `dual` (3, N+1, n) at the grid points k_first … k_last − 1; weights as in `tracking_kernel.solve`."""
+    """Write Q z into `dual` (3, N+1, n) at grid points k_first … k_last − 1; weights: see `tracking_kernel.solve`."""
     for k in range(k_first, k_last):
         for j in range(z.shape[2]):
             dual[0, k, j] = (weights[0, j] + node_weights[k]) * z[0, k, j]

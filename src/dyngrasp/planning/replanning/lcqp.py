@@ -23,7 +23,7 @@ from dyngrasp.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class StageDynamics:
-    """C_{k+1} s_{k+1} = A_k s_k for k = 0 … N−1, both (N, 2n+1, 3n+1), s = [δq (rad), δq̇ (rad/s), δv (rad/s²), δT (s)]."""
+    """C_{k+1} s_{k+1} = A_k s_k for k = 0 … N−1, both (N, 2n+1, 3n+1), s = [δq, δq̇, δv, δT] in rad, s."""
 
     C: Array
     A: Array

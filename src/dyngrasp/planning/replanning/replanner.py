@@ -1,4 +1,4 @@
-"""The online replanner: from a running plan and new targets to a new plan, audited and in time, or to the old one with a reason."""
+"""The online replanner: a new plan for new targets, audited and in time, or the old one and the reason why."""
 
 from __future__ import annotations
 
@@ -47,11 +47,12 @@ class ReplannerSettings:
         fresh_budget: The same for a fresh plan (s), which the old plan bridges.
         tracking: Of the quadratic program.
         least_horizon: Shorter rests of a phase are not touched (s): nothing could be corrected in them but violently.
-        finger_clearance: Grasp updates end when the closing gap is within twice this of the part's width (m): from then on
-            the fingers meet the part, which moves with them and not with its estimate.
+        finger_clearance: Grasp updates end when the closing gap is within twice this of the part's width (m): from
+            then on the fingers meet the part, which moves with them and not with its estimate.
         recovery_share: σ of `funnel_recovery`.
         settled: A moving part's grasp time is iterated until the predicted part moves less than this (m).
-        gate: Whether the audit decides on publication. It does, but where the paper's own method is to be shown as it is.
+        gate: Whether the audit decides on publication. It does, but where the paper's own method is to be shown as it
+            is.
     """
 
     budget: float = 0.020
@@ -144,15 +145,16 @@ class Replanner:
             t: Now (s), on the plan's clock.
 
         Returns:
-            A new plan that takes over at t + budget, with q, q̇ and q̈ of the old one there; or the old plan with a status.
+            A new plan that takes over at t + budget, with q, q̇ and q̈ of the old one there; or the old plan with a
+            status.
         """
         return _Attempt(self, plan, t).towards(targets)
 
     def replan_to_pose(self, plan: GraspPlan, previous: GraspTargets, estimate: PoseEstimate, t: float) -> ReplanResult:
         """The whole cycle: from an estimate of the part's pose through the inverse kinematics to an audited plan.
 
-        A moving part is predicted to the time of the grasp. That time changes with the plan, so both are iterated until the
-        predicted part no longer moves.
+        A moving part is predicted to the time of the grasp. That time changes with the plan, so both are iterated
+        until the predicted part no longer moves.
 
         Args:
             plan: The running plan.
@@ -274,7 +276,7 @@ class _Attempt:
         return report
 
     def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> GraspPlan | None:
-        """Solve the phases that the audit refuses under all constraints, from the candidate; None if that does not help."""
+        """Solve the phases that the audit refuses under all constraints; None if that does not help."""
         assert self.full is not None
         assert self.report is not None
         assert self.recovery is not None

@@ -3,15 +3,17 @@
 The approach is cut at the splice and what is left of it laid on a grid of its own; the new plan begins there. The hand
 goes on with what is left of its motion: at rest it stays at rest, moving it is tracked with the arm on one clock.
 
-While the hand closes the duration is kept: its motion then stays exactly what it was, within its limits and without a jump. The splice
-falls on the next grid point, the past of the phase stays in the plan, and only the arm's rest is tracked.
+While the hand closes the duration is kept: its motion then stays exactly what it was, within its limits and without a
+jump. The splice falls on the next grid point, the past of the phase stays in the plan, and only the arm's rest is
+tracked.
 
-Phases that have not begun are tracked whole. Their duration may change, but for a closing hand not below what its limits need.
+Phases that have not begun are tracked whole. Their duration may change, but for a closing hand not below what its
+limits need.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,20 +33,21 @@ class TrackingSettings:
 
     Attributes:
         weights: Of the deviations from the running plan.
-        velocity_fraction: Part of the speed limits that a plan may use, as the planner's; the rest serves the controller.
+        velocity_fraction: Part of the speed limits that a plan may use, as the planner's; the rest serves the
+            controller.
         position_margin: Distance kept from the position limits (rad), less where a boundary state is closer.
         shortest, longest: Bounds on a duration, as shares of the one before.
         paper_rows: See `TrackingProblem`.
         descent: Through the funnel.
     """
 
-    weights: TrackingWeights = TrackingWeights()
+    weights: TrackingWeights = field(default_factory=TrackingWeights)
     velocity_fraction: float = 0.95
     position_margin: float = 0.01
     shortest: float = 0.5
     longest: float = 2.0
     paper_rows: bool = False
-    descent: DescentSettings = DescentSettings()
+    descent: DescentSettings = field(default_factory=DescentSettings)
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Candidate:
 
 
 def splice_time(plan: GraspPlan, wanted: float) -> float:
-    """The first time at or after `wanted` at which the plan may be cut: any, but a grid point while the hand closes (s)."""
+    """The first time from `wanted` on at which the plan may be cut: any, but a grid point while the hand closes (s)."""
     if plan.phase_at(wanted) != GRASP:
         return wanted
     start = plan.phase_ends[APPROACH]
@@ -81,7 +84,7 @@ def splice_time(plan: GraspPlan, wanted: float) -> float:
 
 
 def rest_of(trajectory: Trajectory, start: float, intervals: int) -> Trajectory:
-    """What is left of a motion after `start` (s), sampled on a grid of its own; obeys the trapezoidal rule only nearly."""
+    """What is left of a motion after `start` (s), on a grid of its own; obeys the trapezoidal rule only nearly."""
     times = np.linspace(start, trajectory.duration, intervals + 1)
     return Trajectory(trajectory.duration - start, *trajectory.sample_many(times))
 
@@ -316,7 +319,7 @@ def _program(
 def hold_start(
     motion: Trajectory, state: JointState, end: BoundaryState, task: GraspTask, settings: TrackingSettings
 ) -> Trajectory | None:
-    """The motion nearest to a given one, in the same time, that begins with the acceleration of `state`; None if there is none.
+    """The motion nearest to a given one, in the same time, with the first acceleration of `state`; None if none is.
 
     Solvers of whole phases choose the first acceleration freely; at a splice it is what the running plan has there.
     """

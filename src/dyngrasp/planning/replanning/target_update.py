@@ -1,4 +1,4 @@
-"""New boundary states for a new pose of the part that continue those of the running plan: same grasp, same posture of the arm."""
+"""New boundary states for a new pose of the part: the same grasp and the same posture of the arm as the plan's."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from dyngrasp.signals import Array
 # Where the arm angle of the running plan is forbidden at the new pose, others are tried, nearest first (rad).
 _ARM_ANGLE_STEPS = np.deg2rad(np.arange(2.0, 61.0, 2.0))
 
-# The wrist follows the part's yaw; a joint that turns farther (rad) has flipped to an equivalent angle beyond its limits.
+# The wrist follows the part's yaw; a joint that turns farther (rad) has flipped to an equivalent angle beyond its
+# limits.
 _LARGEST_TURN = 2.5
 
 
@@ -39,9 +40,9 @@ class TargetUpdater:
     ) -> GraspTargets:
         """Boundary states at a new pose.
 
-        The branch of the inverse kinematics and the arm angle stay those of the running plan, so that the posture moves as little
-        as the part does. Where a limit forbids that arm angle the nearest admissible one of the same branch is taken. Arms
-        without a closed form descend from the posture of the running plan.
+        The branch of the inverse kinematics and the arm angle stay those of the running plan, so that the posture
+        moves as little as the part does. Where a limit forbids that arm angle the nearest admissible one of the same
+        branch is taken. Arms without a closed form descend from the posture of the running plan.
 
         Args:
             previous: What the running plan was made for.
@@ -101,7 +102,7 @@ class TargetUpdater:
         return self._outward
 
     def posture(self, T_world_flange: pin.SE3, q_previous: Array) -> Array:
-        """The configuration (n,) of the same branch, and arm angle if the limits allow it, as a previous one (n,) (rad).
+        """The configuration (n,) of the branch, and if the limits allow of the arm angle, of a previous one (n,) (rad).
 
         Raises:
             OutOfReach: There is none near.

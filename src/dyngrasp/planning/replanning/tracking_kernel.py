@@ -1,4 +1,4 @@
-"""The tracking program of one phase in compiled code: one factorisation where no box is active, else an interior point method."""
+"""The tracking program of one phase in compiled code."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ def solve(
         boxes: (4, n) q_min, q_max, q̇_max, v_max.
         paper_rows: The boxes of eq. (14c), which are linear about the reference, instead of the exact ones.
         duration: Bounds of T (s); equal ones fix it.
-        first, taps, bands: Of `filters`.
+        first: Of `filters`.
+        taps: Of `filters`.
+        bands: Of `filters`.
         max_iterations: Of the interior point method.
         z: (3, K, n), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
         codes: At least 6 K n integers, overwritten by the codes of the rows that were imposed.

@@ -4,9 +4,10 @@ The paper's step (δq, δq̇, δv, δT) and the step (δq, δw, δa, δT) of w =
 
     δw = T* δq̇ + q̇* δT,      δa = T*² δv + 2 T* v* δT,
 
-which turns the linearised dynamics (12) into the exact ones: they are linear in (q, w, a) and free of T. So both are one program, with the same
-weights and the same minimiser; but a step taken in (q, w, a) obeys the trapezoidal rule to rounding, while the paper's update (15) drops the
-products of deviations. For given δT the program falls apart into one pentadiagonal system a joint.
+which turns the linearised dynamics (12) into the exact ones: they are linear in (q, w, a) and free of T. So both are
+one program, with the same weights and the same minimiser; but a step taken in (q, w, a) obeys the trapezoidal rule to
+rounding, while the paper's update (15) drops the products of deviations. For given δT the program falls apart into
+one pentadiagonal system a joint.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from dyngrasp.trajectory import Trajectory
 class TrackingWeights:
     """Weights of eq. (14), the same for all grid points.
 
-    With position and rate weights of zero the step is the smoothest one: the correction spreads over the whole horizon and has
-    almost arrived when the hand comes down the funnel. Weight on the position delays it to the end, where the funnel is narrow.
+    With position and rate weights of zero the step is the smoothest one: the correction spreads over the whole
+        horizon and has
+    almost arrived when the hand comes down the funnel. Weight on the position delays it to the end, where the funnel
+    is narrow.
 
     Attributes:
         position: Q_q (1/rad²).
@@ -62,9 +65,10 @@ class TrackingProblem:
         velocity_limit, acceleration_limit: (n,) limits, +inf where there is none.
         min_duration, max_duration: Bounds of ΔT (s), 0 < min ≤ max < ∞; equal ones fix it.
         weights: Of the deviations.
-        paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the motion then is that of the paper's
-            update (15), with its defect.
-        node_weights: (N+1,) added to Q_q at each grid point, where the motion has to stay with the reference; none if left out.
+        paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the motion then is that of
+            the paper's update (15), with its defect.
+        node_weights: (N+1,) added to Q_q at each grid point, where the motion has to stay with the reference; none if
+            left out.
     """
 
     reference: Trajectory
