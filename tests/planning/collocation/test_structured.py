@@ -152,7 +152,7 @@ def test_the_method_itself_finds_the_closed_form(make_problem, N, adaptive):
     model = PhaseModel(problem, [], limits, work)
     start = least_effort(problem, 3 * best_duration(problem))
     method = InteriorPoint(InteriorPointSettings(adaptive=adaptive))
-    outcome, best, iterations = method.solve(model, model.map.unknowns(start), start.duration, np.inf)
+    outcome, best, iterations = method.solve(model, model.map.unknowns(start), start.duration)
     assert outcome is Outcome.OPTIMAL
     assert iterations > 0
     assert best.objective == pytest.approx(least_cost(problem, best_duration(problem)), rel=1e-8)
@@ -239,7 +239,7 @@ def test_monotone_mode_alone_reaches_the_same_optimum(structured, iiwa, seed):
     model = PhaseModel(problem, functions, limits, WorkArrays(31, 7, limits.constraint_rows, limits.rows_per_point))
     start = least_effort(problem, 2.0)
     method = InteriorPoint(InteriorPointSettings(adaptive=False))
-    outcome, best, _ = method.solve(model, model.map.unknowns(start), 2.0, np.inf)
+    outcome, best, _ = method.solve(model, model.map.unknowns(start), 2.0)
     assert outcome is Outcome.OPTIMAL
     assert best.objective == pytest.approx(structured.solve(problem).objective, rel=1e-6)
 

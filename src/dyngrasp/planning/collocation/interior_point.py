@@ -31,7 +31,7 @@ from dyngrasp.signals import Array
 KEEP = 0.995  # a step takes at most this share of a slack or multiplier
 MEMORY = 5  # iterations within which E must fall in free mode
 FALL = 0.9999  # by which factor
-ENOUGH = 0.5  # by which factor it must fall in monotone mode before the free one is tried again
+ENOUGH = 0.1  # by which factor it must fall in monotone mode before the free one is tried again
 ARMIJO = 1e-4
 ROUNDING = 1e-13  # of the merit, relative
 SHORTEST = 1e-10  # step length at which the line search gives up
@@ -67,7 +67,13 @@ class InteriorPoint:
         self.T_old = 0.0
 
     def solve(
-        self, model: PhaseModel, x: Array, T: float, deadline: float, multipliers: Array | None = None
+        self,
+        model: PhaseModel,
+        x: Array,
+        T: float,
+        deadline: float = np.inf,
+        barrier: float = 1e-3,
+        multipliers: Array | None = None,
     ) -> tuple[Outcome, Best, int]:
         """Minimise from x (N−1, n) and T.
 
@@ -76,6 +82,7 @@ class InteriorPoint:
             x: Start, unknowns of `ThreeTap`.
             T: Start, duration (s).
             deadline: A value of `time.perf_counter`; the best iterate until then is returned.
+            barrier: μ at the start, relative to the objective.
             multipliers: Of the rows at the solution of a problem nearby, for a warm start.
 
         Returns:
@@ -90,6 +97,7 @@ class InteriorPoint:
             return Outcome.NONFINITE, Best(self.x.copy(), T), 0
         self.unit = max(abs(objective), 1e-3)
         self.price = settings.price * self.unit
+        self.first_mu = barrier * self.unit
         self.best = Best(self.x.copy(), T)
         self._restart(1.0, 0)
         if multipliers is not None:
@@ -149,7 +157,7 @@ class InteriorPoint:
         """Slacks and multipliers for the present point, in free mode; `factor` weighs the objective."""
         settings = self.settings
         self.model.factor = factor
-        self.mu = settings.initial_barrier * self.unit
+        self.mu = self.first_mu
         self.model.values(self.x, self.T, self.g)
         rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
         self.free, self.history, self.reference, self.mean = settings.adaptive, [], np.inf, self.mu

@@ -18,20 +18,18 @@ class InteriorPointSettings:
         tolerance: E at the solution, relative to the objective.
         violation_tolerance: Largest violation of a row at the solution, in its scaled unit.
         max_iterations: Newton systems.
-        initial_barrier: μ at the start, relative to the objective.
-        warm_barrier: The same where multipliers are known.
+        warm_barrier: μ at a start with known multipliers, relative to the objective.
         least_slack: Slack that a violated row begins with.
         price: ν at the start, relative to the objective.
         adaptive: Whether to use free mode at all.
     """
 
-    tolerance: float = 1e-9
+    tolerance: float = 1e-8
     violation_tolerance: float = 1e-9
     max_iterations: int = 200
-    initial_barrier: float = 1e-3
     warm_barrier: float = 1e-5
     least_slack: float = 1e-2
-    price: float = 3.0
+    price: float = 1.0
     adaptive: bool = True
 
 

@@ -38,13 +38,15 @@ class StructuredSettings:
         max_iterations: Of the interior point method.
         time_limit: Wall time for one phase (s); after it the best iterate is returned.
         initial_barrier: Barrier parameter of a cold start, relative to the objective.
+        guess_barrier: The same where a guess is given: a larger one would drive it away.
     """
 
-    tolerance: float = 1e-9
+    tolerance: float = 1e-8
     violation_tolerance: float = 1e-9
     max_iterations: int = 200
     time_limit: float = 5.0
     initial_barrier: float = 1e-3
+    guess_barrier: float = 1e-4
 
 
 _STATUS = {
@@ -66,6 +68,7 @@ _WORDS = {
 }
 
 
+TOO_FAST = 1.05  # speed over its limit above which a guess is slowed down
 KEPT = 16  # problem sizes whose arrays, and solutions whose multipliers, are kept
 
 
@@ -124,8 +127,10 @@ class StructuredSolver:
 
         start = _stretched(problem, T) if guess is None else on_grid(problem, guess)
         known = self._multipliers(guess, problem.intervals, limits.rows_per_point)
+        barrier = settings.initial_barrier if guess is None else settings.guess_barrier
         deadline = began + settings.time_limit
-        outcome, best, iterations = method.solve(model, model.map.unknowns(start), start.duration, deadline, known)
+        x, T = model.map.unknowns(start), start.duration
+        outcome, best, iterations = method.solve(model, x, T, deadline, barrier, known)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
@@ -148,7 +153,7 @@ class StructuredSolver:
         if kept is None:
             settings = self.settings
             numbers = (settings.tolerance, settings.violation_tolerance, settings.max_iterations)
-            kept = WorkArrays(*size), InteriorPoint(InteriorPointSettings(*numbers, settings.initial_barrier))
+            kept = WorkArrays(*size), InteriorPoint(InteriorPointSettings(*numbers))
         self._methods[size] = kept
         while len(self._methods) > KEPT:
             del self._methods[next(iter(self._methods))]
@@ -208,7 +213,13 @@ def on_grid(problem: PhaseProblem, guess: Trajectory) -> Trajectory:
     shortest = max(problem.min_duration, min(closed_form.SHORTEST_DURATION, problem.max_duration))
     duration = float(np.clip(guess.duration, shortest, problem.max_duration))
     _, _, acceleration = guess.sample_many(times)
-    return closed_form.nearest_trajectory(problem, guess.duration**2 * acceleration, duration)
+    curvature = guess.duration**2 * acceleration
+    motion = closed_form.nearest_trajectory(problem, curvature, duration)
+    # A guess that is too fast keeps its path and takes its time.
+    ratio = float((np.abs(motion.velocity) / problem.velocity_limit).max())
+    if ratio <= TOO_FAST:
+        return motion
+    return closed_form.nearest_trajectory(problem, curvature, min(ratio * duration, problem.max_duration))
 
 
 @functools.cache
@@ -232,5 +243,5 @@ def compile_kernels() -> None:
     x = model.map.unknowns(start)
     for adaptive in (True, False):
         method = InteriorPoint(InteriorPointSettings(max_iterations=3, adaptive=adaptive))
-        method.solve(model, x, 1.0, np.inf)
-        method.solve(model, x, 1.0, np.inf, method.multiplier.copy())
+        method.solve(model, x, 1.0)
+        method.solve(model, x, 1.0, multipliers=method.multiplier.copy())
