@@ -48,6 +48,7 @@ class Drawing:
     pieces: list[Manifold] = field(default_factory=list)
 
     def add(self, body: Manifold, *, contact: bool = True) -> None:
+        """Add a body; only the concave foundry fillets are no contact pieces."""
         self.bodies.append(body)
         if contact:
             self.pieces.append(body)
@@ -56,7 +57,8 @@ class Drawing:
         self.cores.append(core)
 
     def solid(self) -> Manifold:
-        return _union(self.bodies) - _union(self.cores)
+        """Bodies less cores, without edges so short that single precision would merge their ends."""
+        return (_union(self.bodies) - _union(self.cores)).simplify(0.002)
 
 
 def _union(parts: list[Manifold]) -> Manifold:
@@ -129,6 +131,10 @@ def web(start: Point, end: Point, thickness: float, profile: list[Point]) -> Man
 
 # --- the bodies -------------------------------------------------------------------------------------------------------
 
+DECKS: tuple[list[Point], ...] = (
+    [(-51, -19), (3, -21), (1, 63), (-47, 65)],
+    [(-3, -64), (49, -66), (51, 22), (-3, 19)],
+)
 HOUSING = (-80.0, 9.0)
 HOUSING_RADIUS = 26.0
 TOWER_CENTRE = (77.0, -7.0)
@@ -156,6 +162,8 @@ def draw_rib(drawing: Drawing) -> None:
     drawing.cut(block(core, -1.0, RIB_TOP - 7.0, draft=0.5, edge=3.0))
     # Foundry fillets along both faces end below the zone that the fingers use.
     radius, foot = 5.0, DECK
+    # Each stands on the flat top of one deck: on the other side of the rib the decks end at its face.
+    flats = _union([_outline(polygon, 7.0).offset(-5.0, JoinType.Round, 2.0, 16).extrude(60.0) for polygon in DECKS])
     for sign in (-1.0, 1.0):
         arc = [
             (sign * (half + radius - radius * math.cos(a)), foot + radius - radius * math.sin(a))
@@ -165,15 +173,12 @@ def draw_rib(drawing: Drawing) -> None:
         profile.append((sign * (half - 1.0), foot + radius))
         section = CrossSection([profile], FillRule.EvenOdd)
         strip = section.extrude(58.0).rotate((90.0, 0.0, 90.0)).translate((-29.0, 0.0, 0.0))
-        drawing.add(strip, contact=False)
+        drawing.add(strip ^ flats, contact=False)
 
 
 def draw_decks(drawing: Drawing, wall: float) -> None:
     """Two hollow decks beside the rib, set off from each other, each with a machined marker pad."""
-    for polygon in (
-        [(-51, -19), (3, -21), (1, 63), (-47, 65)],
-        [(-3, -64), (49, -66), (51, 22), (-3, 19)],
-    ):
+    for polygon in DECKS:
         outline = _outline(polygon, 7.0)
         drawing.add(block(outline, 0.0, DECK, draft=2.0, edge=3.0))
         drawing.cut(block(outline.offset(-wall, JoinType.Round, 2.0, 16), -1.0, DECK - wall, draft=2.0))
@@ -186,7 +191,9 @@ def draw_decks(drawing: Drawing, wall: float) -> None:
     drawing.cut(block(step.offset(-wall, JoinType.Round, 2.0, 16), -1.0, 20.0 - wall))
     for x, y, top in ((-38.0, -31.0, 28.0), (-16.0, -27.0, 28.0)):
         drawing.add(block(discs((x, y, 7.5)), 4.0, top, draft=0.7, edge=1.0, edge_steps=2))
-        drawing.add(root_fillet(x, y, 7.2, 20.0, 3.0), contact=False)
+        # Where the flat top of the step ends, its fillet ends too.
+        flat = step.offset(-4.5, JoinType.Round, 2.0, 16).extrude(40.0)
+        drawing.add(root_fillet(x, y, 7.2, 20.0, 3.0) ^ flat, contact=False)
         drawing.cut(cylinder(x, y, 2.6, 8.0, top + 1.0, 16))
 
 
@@ -195,7 +202,7 @@ def draw_housing(drawing: Drawing, wall: float) -> None:
     x, y = HOUSING
     drawing.add(block(discs((x, y, HOUSING_RADIUS)), 0.0, 60.0, draft=0.8, edge=1.0, edge_steps=2))
     drawing.add(block(discs((x, y, HOUSING_RADIUS + 1.5)), 54.0, 64.0, edge=1.5), contact=True)
-    drawing.add(root_fillet(x, y, HOUSING_RADIUS, 5.0, 5.0), contact=False)
+    drawing.add(root_fillet(x, y, HOUSING_RADIUS, 5.0, 3.5), contact=False)
     drawing.cut(cylinder(x, y, HOUSING_RADIUS - 1.2 * wall - 0.8, -1.0, 58.0, 40))
     drawing.cut(cylinder(x, y, HOUSING_RADIUS - 8.5, 53.0, 70.0, 40))
     for quarter in range(4):
@@ -237,7 +244,7 @@ def draw_port(drawing: Drawing, plate_thickness: float) -> None:
     drawing.add(plate)
     for dx in (-19.0, 19.0):
         drawing.cut(cylinder_y(PORT_X + dx, PORT_Z, 3.2, start - 6.0, start + 40.0, 16))
-    drawing.add(box((PORT_X - 3.0, 15.0, 0.0), (PORT_X + 3.0, start + 0.5, 10.0)), contact=False)
+    drawing.add(box((PORT_X - 3.0, 15.0, 2.0), (PORT_X + 3.0, start + 0.5, 10.0)))
 
 
 def draw_flange(drawing: Drawing) -> None:
@@ -255,7 +262,7 @@ def draw_flange(drawing: Drawing) -> None:
     anchors = [(-40.0, 52.0), (-40.0, -30.0), (40.0, -52.0), (84.0, 6.0), (44.0, 46.0)]
     for (x, y), (ax, ay) in zip(EARS, anchors, strict=True):
         drawing.add(block(discs((x, y, 11.5), (ax, ay, 13.0)), 0.0, 6.0, edge=1.5))
-        drawing.add(block(discs((x, y, 9.0)), 0.0, 9.0, edge=0.8, edge_steps=2), contact=False)
+        drawing.add(block(discs((x, y, 9.0)), 2.0, 9.0, edge=0.8, edge_steps=2))
         drawing.cut(cylinder(x, y, 4.3, -1.0, 20.0, 20))
     # Windows in the flange where no body stands above: cast light.
     drawing.cut(block(_outline([(7, 24), (24, 24), (24, 46), (7, 46)], 4.0), -1.0, 9.0))
@@ -270,10 +277,10 @@ def draw_webs(drawing: Drawing) -> None:
         r0, r1 = HOUSING_RADIUS - 2.0, HOUSING_RADIUS + reach - 7.0
         start = (HOUSING[0] + r0 * c, HOUSING[1] + r0 * s)
         end = (HOUSING[0] + r1 * c, HOUSING[1] + r1 * s)
-        drawing.add(web(start, end, 5.0, ramp), contact=False)
-    drawing.add(web((60.0, -3.0), (52.0, -3.0), 6.0, [(0, 2), (1, 2), (1, 28), (0, 50)]), contact=False)
-    drawing.add(web((-62.0, 8.0), (-51.0, 8.0), 6.0, [(0, 2), (1, 2), (1, 32), (0, 56)]), contact=False)
-    drawing.add(web((16.0, -20.0), (-20.0, -42.0), 4.0, [(0.3, 2), (1, 2), (1, 6), (0.3, 30)]), contact=False)
+        drawing.add(web(start, end, 5.0, ramp))
+    drawing.add(web((60.0, -3.0), (52.0, -3.0), 6.0, [(0, 2), (1, 2), (1, 28), (0, 50)]))
+    drawing.add(web((-62.0, 8.0), (-51.0, 8.0), 6.0, [(0, 2), (1, 2), (1, 32), (0, 56)]))
+    drawing.add(web((16.0, -20.0), (-20.0, -42.0), 4.0, [(0.3, 2), (1, 2), (1, 6), (0.3, 30)]))
 
 
 def draw(wall: float) -> Drawing:
@@ -414,6 +421,8 @@ def main() -> None:
     for stale in OUTPUT.glob("piece_*.stl"):
         stale.unlink()
     mesh.export(OUTPUT / "casting.stl")
+    if not trimesh.load_mesh(OUTPUT / "casting.stl").is_watertight:
+        raise SystemExit("the mesh is not closed any more in single precision")
     names = []
     for i, piece in enumerate(drawing.pieces):
         names.append(f"piece_{i:02d}.stl")

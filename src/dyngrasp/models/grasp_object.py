@@ -18,7 +18,7 @@ from dyngrasp.signals import Array, read_only
 # A piece counts as convex if it fills its hull to this share: vertices are stored in single precision.
 CONVEX_SHARE = 1e-4
 
-# Corners that stand for the outline of the underside; in between, an edge is at most a few millimetres farther out.
+# Corners that stand for the outline of the underside; the casting's edge is 6 mm farther out between them at most.
 UNDERSIDE_CORNERS = 8
 
 
@@ -169,13 +169,18 @@ class GraspObject:
     def underside(self) -> Array:
         """(UNDERSIDE_CORNERS, 3) corners of the face it stands on, in the object frame (m).
 
-        They are the outermost of its lowest points in as many evenly spread directions; some may coincide.
+        Each is the outermost of its lowest points in the direction in which the ones before it leave most of the
+        outline out; some may coincide.
         """
         vertices = np.vstack([trimesh.load_mesh(path).vertices for path in self.piece_paths])
         lowest = vertices[vertices[:, 2] < vertices[:, 2].min() + 1e-4]
-        angles = 2 * np.pi * np.arange(UNDERSIDE_CORNERS) / UNDERSIDE_CORNERS
-        directions = np.column_stack([np.cos(angles), np.sin(angles)])
-        return read_only(lowest[np.argmax(directions @ lowest[:, :2].T, axis=1)])
+        angles = np.deg2rad(np.arange(360))
+        reach = np.column_stack([np.cos(angles), np.sin(angles)]) @ lowest[:, :2].T
+        corners = [int(reach[0].argmax())]
+        while len(corners) < UNDERSIDE_CORNERS:
+            left_out = reach.max(axis=1) - reach[:, corners].max(axis=1)
+            corners.append(int(reach[left_out.argmax()].argmax()))
+        return read_only(lowest[corners])
 
 
 def read_object(path: str | Path) -> GraspObject:
