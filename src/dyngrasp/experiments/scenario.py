@@ -22,6 +22,7 @@ __all__ = [
     "PlantSection",
     "PoseSection",
     "RenderSection",
+    "ReplannerSection",
     "TaskSection",
     "load_scenario",
 ]
@@ -122,7 +123,7 @@ class PartSection(StrictSchema):
 class PlannerSection(StrictSchema):
     """`[planner]`: `effort_weight` is ρ of eq. (3a) in s⁴/rad² (the paper: 1), `intervals` is N."""
 
-    backend: Literal["ipopt"] = "ipopt"
+    backend: Literal["structured", "ipopt"] = "structured"
     effort_weight: NonNegative = 1.0
     intervals: Annotated[int, Field(ge=4, le=1000)] = 100
 
@@ -133,7 +134,10 @@ class PoseSection(StrictSchema):
     With `source = "noise"` each trial draws an error of the translation uniformly from a ball of radius `position_mm`
     and a turn about a random axis by up to `rotation_deg`, about the grasp point. `along_mm`, `across_mm` and `up_mm`
     are added on top, in the grasp frame (x along the rib, y across it, z outward); with `random_sign` each trial draws
-    their signs.
+    their signs. With `draw = "planar"` the error is exactly `position_mm` in a random horizontal direction and exactly
+    `rotation_deg` about the vertical, to either side.
+
+    The remaining keys say what a camera on the hand would reveal to a replanner, see `PoseNoiseSettings`.
     """
 
     source: Literal["truth", "noise"] = "truth"
@@ -143,6 +147,13 @@ class PoseSection(StrictSchema):
     across_mm: Finite = 0.0
     up_mm: Finite = 0.0
     random_sign: bool = True
+    draw: Literal["ball", "planar"] = "ball"
+    reveal_from_m: NonNegative = 0.40
+    reveal_to_m: NonNegative = 0.15
+    residual_mm: NonNegative = 1.0
+    residual_deg: NonNegative = 0.5
+    frame_mm: NonNegative = 0.2
+    frame_deg: NonNegative = 0.05
 
     @model_validator(mode="after")
     def _truth_is_exact(self) -> Self:
@@ -151,6 +162,20 @@ class PoseSection(StrictSchema):
         ):
             raise ValueError('no errors with source = "truth"; set source = "noise"')
         return self
+
+
+class ReplannerSection(StrictSchema):
+    """`[replanner]`: whether the plan is replaced as the pose becomes known, how often (Hz), and how fast.
+
+    `latency_ms` is the time from question to answer, `"measured"` what it really takes on this machine; what takes longer
+    than `budget_ms` is discarded. `mode = "lcqp"` is the paper's program and update, published unchecked.
+    """
+
+    enabled: bool = False
+    rate_hz: Annotated[float, Field(gt=0.0, le=100.0)] = 10.0
+    budget_ms: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
+    latency_ms: NonNegative | Literal["measured"] = 20.0
+    mode: Literal["exact", "lcqp"] = "exact"
 
 
 class PlantSection(StrictSchema):
@@ -172,7 +197,7 @@ class RenderSection(StrictSchema):
     """`[render]`: the video of `dyngrasp run`."""
 
     video: bool = True
-    frames_per_second: Annotated[float, Field(gt=0.0, le=240.0)] = 30.0
+    frames_per_second: Annotated[float, Field(gt=0.0, le=240.0)] = 20.0
     width: Annotated[int, Field(ge=64, le=4096, multiple_of=2)] = 960
     height: Annotated[int, Field(ge=64, le=4096, multiple_of=2)] = 540
 
@@ -187,6 +212,7 @@ class Scenario(StrictSchema):
     part: PartSection
     planner: PlannerSection = PlannerSection()
     pose: PoseSection = PoseSection()
+    replanner: ReplannerSection = ReplannerSection()
     plant: PlantSection = PlantSection()
     render: RenderSection = RenderSection()
 

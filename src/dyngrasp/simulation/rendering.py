@@ -28,10 +28,10 @@ class View:
         fov_deg: Vertical field of view.
     """
 
-    lookat: tuple[float, float, float] = (0.34, 0.0, 0.45)
-    distance: float = 1.95
-    azimuth_deg: float = 132.0
-    elevation_deg: float = -18.0
+    lookat: tuple[float, float, float] = (0.36, -0.06, 0.47)
+    distance: float = 1.72
+    azimuth_deg: float = 128.0
+    elevation_deg: float = -16.0
     fov_deg: float = 38.0
 
 

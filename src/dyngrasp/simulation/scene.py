@@ -148,7 +148,7 @@ def _set_stage(spec: MjSpec, settings: SceneSettings) -> None:
     spec.stat.extent = 1.4
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = 1920, 1080
-    visual.quality.shadowsize, visual.quality.offsamples = 4096, 8
+    visual.quality.shadowsize, visual.quality.offsamples = 2048, 4
     visual.map.znear, visual.map.zfar = 0.02, 30.0
     visual.headlight.ambient, visual.headlight.diffuse = [0.32] * 3, [0.28] * 3
     visual.headlight.specular = [0.05] * 3
