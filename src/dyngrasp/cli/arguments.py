@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 DELIVERED, NOT_DELIVERED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit statuses: done and good, done and not good, bad input or usage, interrupted."""
 
 _SCENARIO = "a scenario file (TOML)"
 _SEED = "draws where the part lies and how the plant deviates; default: the scenario's own seed"
+_no_replan: dict[str, Any] = {
+    "action": "append_const",
+    "const": "replanner.enabled=false",
+    "dest": "overrides",
+    "help": "keep the first plan whatever becomes known of the pose, for comparison",
+}
 _SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"
 
 
@@ -27,6 +34,7 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     run.add_argument("--out", metavar="DIR", help="where the results go; default: out/<name of the scenario>")
     run.add_argument("--seed", type=_seed, metavar="S", help=_SEED)
     run.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
+    run.add_argument("--no-replan", **_no_replan)
     run.add_argument("--no-video", action="store_false", dest="video", help="do not render")
 
     plan = commands.add_parser("plan", help="plan only and write the plan")
@@ -40,6 +48,7 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     study.add_argument("--trials", type=_count, metavar="N", required=True, help="number of trials")
     study.add_argument("--seed", type=_seed, metavar="S", help="every trial's own seed is drawn from this one")
     study.add_argument("--out", metavar="DIR", required=True, help="where trials.parquet and study.json go")
+    study.add_argument("--no-replan", **_no_replan)
     study.add_argument("--workers", type=_count, metavar="W", help="processes; default: one a core")
     study.add_argument("--json", metavar="FILE", help="write the rows also as JSON, with machine and versions")
     study.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)

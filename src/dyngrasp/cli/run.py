@@ -119,7 +119,8 @@ def _figure(
 
     verdict = "delivered" if document["success"] else "not delivered"
     title = f"{workcell.scenario.name} · seed {document['seed']} · {verdict}"
-    figure = episode_figure(workcell.task, planned.targets, planned.result.require(), executed.record, title)
+    first = planned.result.require()
+    figure = episode_figure(workcell.task, planned.targets, first, executed.record, title, executed.plan)
     save_figure(figure, out / "trajectory.png")
 
 

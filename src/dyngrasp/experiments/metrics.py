@@ -247,8 +247,10 @@ def _within_limits(worst: dict[str, float], t: float) -> Criterion:
 
 
 def _moving(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, limits: SuccessLimits) -> Criterion:
-    span = plan.end_time - plan.start_time
-    low, high = (plan.start_time + share * span for share in limits.speed_window)
+    # A plan that took over during the motion begins later than the motion.
+    start = float(record.t[0])
+    span = plan.end_time - start
+    low, high = (start + share * span for share in limits.speed_window)
     window = (record.t >= low) & (record.t <= high)
     ratio = (np.abs(record.arm_velocity[window]) / task.robot.limits.velocity).max(axis=1)
     slowest = float(ratio.min())

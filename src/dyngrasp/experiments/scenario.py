@@ -167,8 +167,8 @@ class PoseSection(StrictSchema):
 class ReplannerSection(StrictSchema):
     """`[replanner]`: whether the plan is replaced as the pose becomes known, how often (Hz), and how fast.
 
-    `latency_ms` is the time from question to answer, `"measured"` what it really takes on this machine; what takes longer
-    than `budget_ms` is discarded. `mode = "lcqp"` is the paper's program and update, published unchecked.
+    `latency_ms` is the time from question to answer, `"measured"` what it really takes on this machine; what takes
+    longer than `budget_ms` is discarded. `mode = "lcqp"` is the paper's program and update, published unchecked.
     """
 
     enabled: bool = False

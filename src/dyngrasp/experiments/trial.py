@@ -13,15 +13,18 @@ import pinocchio as pin
 
 from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_episode
 from dyngrasp.closed_loop.record import EpisodeRecord
+from dyngrasp.closed_loop.replanning_loop import ReplanEvent
 from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.metrics import Outcome, judge
 from dyngrasp.experiments.provenance import versions
+from dyngrasp.experiments.replanning import replanning_loop, replanning_summary
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.grasp_targets import GraspTargets, ranked_grasp_targets
 from dyngrasp.planning.problem import PlanResult
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
 from dyngrasp.simulation.scene import Scene, SceneSettings, build_scene
+from dyngrasp.trajectory import GraspPlan
 
 # Arm postures that are tried, best first, before a pose counts as not plannable.
 CANDIDATES = 4
@@ -39,11 +42,14 @@ class PlannedTrial:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedTrial:
-    """What happened in the plant, and the verdict on it."""
+    """What happened in the plant, the verdict on it, the plan that was carried out in the end, and every replan."""
 
     record: EpisodeRecord
     outcome: Outcome
     scene: Scene
+    plan: GraspPlan
+    targets: GraspTargets
+    replans: tuple[ReplanEvent, ...] = ()
 
 
 def planner_for(workcell: Workcell) -> CollocationPlanner:
@@ -82,6 +88,7 @@ def execute_trial(
     trial: Trial,
     planned: PlannedTrial,
     progress: Callable[[float, str], None] | None = None,
+    planner: CollocationPlanner | None = None,
 ) -> ExecutedTrial:
     """Carry out a valid plan in the plant that the trial drew, and judge what happened.
 
@@ -90,6 +97,7 @@ def execute_trial(
         trial: Where the part really is and how the plant deviates.
         planned: A plan that passed its audit.
         progress: Called with time (s) and phase as the episode runs.
+        planner: States the problems that the replanner falls back on; one is made if it is needed and left out.
     """
     task, plan = workcell.task, planned.result.require()
     period = 1.0 / workcell.scenario.plant.control_rate_hz
@@ -99,15 +107,19 @@ def execute_trial(
         scene, plan.arm[0].position[0], plan.gripper[0].position[0], trial.T_world_object, t=plan.start_time
     )
     controller = grasp_controller(task, planned.targets.grasp, period)
+    loop = replanning_loop(workcell, trial, plan, planned.targets, planner or planner_for(workcell))
     record = run_episode(
         plan,
         plant,
         controller,
         EpisodeSettings(control_period=period),
+        replanning=loop,
         progress=progress,
         meta={"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()},
     )
-    return ExecutedTrial(record, judge(plan, record, task, planned.targets.grasp), scene)
+    plan, targets, events = (plan, planned.targets, ()) if loop is None else (loop.newest, loop.targets, loop.events)
+    outcome = judge(plan, record, task, targets.grasp)
+    return ExecutedTrial(record, outcome, scene, plan, targets, tuple(events))
 
 
 def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None) -> dict[str, Any]:
@@ -117,6 +129,7 @@ def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None)
         "success": executed is not None and executed.outcome.success,
         "cause": executed.outcome.cause if executed else f"planning: {result.status}: {result.message}",
         "criteria": executed.outcome.summary() if executed else {},
+        "replanning": replanning_summary(executed.replans) if executed else {},
         "phases": result.plan.durations.tolist() if result.plan else [],
         "planning_ms": planned.planning_ms,
         "planning_attempts": planned.attempts,
@@ -152,7 +165,7 @@ def study_row(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> 
     began = time.perf_counter()
     row = _drawn(trial, workcell)
     planned = plan_trial(workcell, trial, planner)
-    executed = execute_trial(workcell, trial, planned) if planned.result.ok else None
+    executed = execute_trial(workcell, trial, planned, planner=planner) if planned.result.ok else None
     document = summary(trial, planned, executed)
     row |= {
         key: document[key] for key in ("success", "cause", "planning_ms", "planning_attempts", "plan_status", "grasp")

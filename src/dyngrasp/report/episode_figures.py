@@ -44,13 +44,18 @@ def measured_curves(record: EpisodeRecord) -> MotionCurves:
 
 
 def episode_figure(
-    task: GraspTask, targets: GraspTargets, plan: GraspPlan, record: EpisodeRecord, title: str = ""
+    task: GraspTask,
+    targets: GraspTargets,
+    plan: GraspPlan,
+    record: EpisodeRecord,
+    title: str = "",
+    last: GraspPlan | None = None,
 ) -> Figure:
-    """The trajectory figure of an episode: the plan dashed, the measurement solid."""
+    """The trajectory figure of an episode: first plan dashed, measurement solid, phases as the last plan has them."""
     return trajectory_figure(
         planned_curves(plan, targets, task),
         measured_curves(record),
-        plan.phase_ends,
+        (last or plan).phase_ends,
         task.robot.limits,
         (task.gripper.lower, task.gripper.upper),
         task.robot.joint_names,
