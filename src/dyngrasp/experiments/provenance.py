@@ -7,13 +7,15 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from dyngrasp import __version__
+
 # What may change a number; the rest is in the lock file.
-_PACKAGES = ("dyngrasp", "numpy", "scipy", "numba", "pin", "casadi", "mujoco", "coal")
+_PACKAGES = ("numpy", "scipy", "numba", "pin", "casadi", "mujoco", "coal")
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that compute."""
-    found = {"python": platform.python_version()}
+    found = {"dyngrasp": __version__, "python": platform.python_version()}
     for package in _PACKAGES:
         try:
             found[package] = version(package)
