@@ -58,7 +58,7 @@ class ReplannerSettings:
     budget: float = 0.020
     fresh_budget: float = 0.100
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
-    least_horizon: float = 0.06
+    least_horizon: float = 0.10
     finger_clearance: float = 0.004
     recovery_share: float = 0.6
     settled: float = 1e-7
@@ -224,23 +224,30 @@ class _Attempt:
             self.recovery = funnel_recovery(self.plan, targets, self.task, self.splice, share)
             if self.recovery is None:
                 return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
-        candidate = self._track(targets)
-        self.iterations = candidate.iterations
-        status = candidate.status
-        if candidate.plan is None:
-            self.reasons.append(f"tracking: {candidate.message}")
-        else:
-            self.report = self._audited(candidate.plan, targets)
+        status, candidate, best = Status.INFEASIBLE, None, None
+        # In the grasp, and where the paper's program has no way of its own, one way is all there is.
+        ways = len(self.settings.tracking.descents) if phase == APPROACH and self.settings.gate else 1
+        for way in range(ways):
+            candidate = self._track(targets, way)
+            self.iterations += candidate.iterations
+            status = candidate.status
+            if candidate.plan is None:
+                self.reasons.append(f"tracking: {candidate.message}")
+                break
+            best = candidate.plan
+            self.report = self._audited(best, targets)
             if self.report.ok or not self.settings.gate:
-                return self._published(candidate.plan, targets, Path.TRACKING, self.settings.budget)
+                return self._published(best, targets, Path.TRACKING, self.settings.budget)
             status = Status.AUDIT_FAILED
             self.reasons.append(f"tracking: {_failures(self.report)}")
             if self._late(self.settings.budget):
-                return self._kept(Status.DEADLINE_MISSED, targets, "no time for the full problem")
-            if self.full is not None and phase == APPROACH:
-                found = self._reoptimised(candidate.plan, targets)
-                if found is not None:
-                    return self._published(found, targets, Path.REOPTIMISED, self.settings.budget)
+                return self._kept(Status.DEADLINE_MISSED, targets, "no time for another attempt")
+            if not _about_the_approach(self.report, best):
+                break
+        if best is not None and self.full is not None and phase == APPROACH:
+            found = self._reoptimised(best, targets)
+            if found is not None:
+                return self._published(found, targets, Path.REOPTIMISED, self.settings.budget)
         return self._fresh_or_kept(targets, estimate, "", status)
 
     def _refusal(self) -> str:
@@ -261,9 +268,9 @@ class _Attempt:
                 return "the fingers close on the part"
         return ""
 
-    def _track(self, targets: GraspTargets) -> Candidate:
+    def _track(self, targets: GraspTargets, way: int = 0) -> Candidate:
         started = time.perf_counter()
-        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking)
+        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking, way)
         self._count("tracking", started)
         return candidate
 
@@ -389,6 +396,11 @@ class _Attempt:
             message,
             self.iterations,
         )
+
+
+def _about_the_approach(report: AuditReport, plan: GraspPlan) -> bool:
+    """Whether all that fails happens before the pre-grasp, where another descent may help."""
+    return all(entry.time <= plan.phase_ends[APPROACH] for entry in report.failures)
 
 
 def _failures(report: AuditReport) -> str:

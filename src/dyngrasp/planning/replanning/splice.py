@@ -38,7 +38,7 @@ class TrackingSettings:
         position_margin: Distance kept from the position limits (rad), less where a boundary state is closer.
         shortest, longest: Bounds on a duration, as shares of the one before.
         paper_rows: See `TrackingProblem`.
-        descent: Through the funnel.
+        descents: Ways through the funnel, the gentlest first; a way is tried where the audit refuses the ones before.
     """
 
     weights: TrackingWeights = field(default_factory=TrackingWeights)
@@ -47,7 +47,7 @@ class TrackingSettings:
     shortest: float = 0.5
     longest: float = 2.0
     paper_rows: bool = False
-    descent: DescentSettings = field(default_factory=DescentSettings)
+    descents: tuple[DescentSettings, ...] = (DescentSettings(earliest=0.6), DescentSettings())
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,12 @@ def rest_of(trajectory: Trajectory, start: float, intervals: int) -> Trajectory:
 
 
 def track(
-    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, settings: TrackingSettings
+    plan: GraspPlan,
+    targets: GraspTargets,
+    task: GraspTask,
+    splice: float,
+    settings: TrackingSettings,
+    way: int = 0,
 ) -> Candidate:
     """Continue a plan from the splice on to new targets.
 
@@ -100,13 +105,14 @@ def track(
         task: Arm, gripper, part.
         splice: From `splice_time`; before the delivery begins.
         settings: How.
+        way: Which of the descents.
     """
     begun = plan.phase_at(splice)
     solutions: list[TrackingSolution] = []
     arm, hand = list(plan.arm), list(plan.gripper)
     for phase in range(begun, 3):
         if phase == APPROACH:
-            solution, arm[phase], hand[phase] = _approach(plan, targets, task, splice, settings)
+            solution, arm[phase], hand[phase] = _approach(plan, targets, task, splice, settings, way)
         elif phase == begun:
             solution, arm[phase] = _rest_of_grasp(plan, targets, task, splice, settings)
         else:
@@ -165,7 +171,7 @@ def hand_needs(trajectory: Trajectory, task: GraspTask) -> float:
 
 
 def _approach(
-    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, settings: TrackingSettings
+    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, settings: TrackingSettings, way: int
 ) -> tuple[TrackingSolution, Trajectory, Trajectory]:
     local = splice - (plan.phase_ends[APPROACH] - plan.durations[APPROACH])
     N, n = plan.arm[APPROACH].intervals, task.robot.n
@@ -174,7 +180,7 @@ def _approach(
     weights = None
     if not settings.paper_rows:
         p_G = task.gripper.T_flange_hand.act(task.gripper.grasp_point(targets.gripper_open))
-        carried = carried_descent(reference, targets.pregrasp.position, p_G, task, settings.descent)
+        carried = carried_descent(reference, targets.pregrasp.position, p_G, task, settings.descents[way])
         if carried is not None:
             reference, weights = carried
     problem = _splice_program(reference, plan, targets.pregrasp, splice, task, settings)
