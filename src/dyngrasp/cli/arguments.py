@@ -53,6 +53,17 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     study.add_argument("--json", metavar="FILE", help="write the rows also as JSON, with machine and versions")
     study.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
 
+    bench = commands.add_parser("bench", help="measure how long planning takes")
+    benchmarks = bench.add_subparsers(dest="benchmark", required=True, metavar="WHAT")
+    bench_plan = benchmarks.add_parser("plan", help="whole plans and their phases, against other solvers")
+    bench_plan.add_argument("--trials", type=_count, metavar="N", default=200, help="poses of each case; default: 200")
+    bench_plan.add_argument("--seed", type=_seed, metavar="S", default=0, help="draws poses and postures; default: 0")
+    bench_plan.add_argument(
+        "--rho", type=_weight, nargs="+", metavar="W", default=[1.0, 1e-3], help="effort weights; default: 1 1e-3"
+    )
+    bench_plan.add_argument("--against", metavar="NAMES", default="", help="other solvers, e.g. ipopt")
+    bench_plan.add_argument("--json", metavar="FILE", help="write all figures, with machine and versions")
+
     commands.add_parser("models", help="list robots, grippers and objects")
 
     check = commands.add_parser("check", help="validate model and scenario files")
@@ -71,6 +82,13 @@ def _count(text: str) -> int:
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"a whole number of at least 1 expected, got {text}")
+    return value
+
+
+def _weight(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"a number of at least 0 expected, got {text}")
     return value
 
 

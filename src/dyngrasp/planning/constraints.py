@@ -218,7 +218,8 @@ def lift_floor(start: ArrayLike, end: ArrayLike, intervals: int, depth: float = 
         (N+1, K) heights (m).
     """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
-    risen = np.minimum(np.linspace(0.0, 1.0, intervals + 1) / LIFT_SHARE, 1.0)[:, None]
+    # Quadratic, so that a delivery that begins at rest can follow.
+    risen = np.minimum(np.linspace(0.0, 1.0, intervals + 1) / LIFT_SHARE, 1.0)[:, None] ** 2
     lowest = np.minimum(start, 0.0)
     # A target on or in the ground is the user's wish; then the part only has to stay above both ends.
     goal = LIFT_CLEARANCE if (end > LIFT_CLEARANCE).all() else min(float(end.min()), 0.0)

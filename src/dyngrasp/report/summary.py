@@ -39,7 +39,7 @@ def run_table(summary: dict[str, Any]) -> Table:
     for name, duration in zip(PHASE_NAMES, phases, strict=False):
         table.add_row(f"  {name}", f"{duration:.3f} s", "")
     table.add_row("  whole motion", f"{sum(phases):.3f} s", "")
-    table.add_row("  planning", f"{summary['planning_ms']:.0f} ms", _attempts(summary["planning_attempts"]))
+    table.add_row("  planning", f"{summary['planning_ms']:.1f} ms", _attempts(summary["planning_attempts"]))
     criteria = summary["criteria"]
     if criteria:
         table.add_row("Criteria", "", "passes when")
