@@ -83,11 +83,11 @@ class Trajectory:
         scaled = np.clip(np.asarray(times, dtype=float), 0.0, self.duration) / step
         k = np.minimum(scaled.astype(int), self.intervals - 1)
         s = (scaled - k)[:, None]
-        q, w, v = self.position[k], self.velocity[k], self.acceleration[k]
-        dv = self.acceleration[k + 1] - v
-        position = q + step * w * s + step**2 * (v * s**2 / 2 + dv * (s**3 / 6 + s / 12))
-        velocity = w + step * (v * s + dv * s**2 / 2)
-        return position, velocity, v + dv * s
+        q, w, v = (table.take(k, axis=0) for table in (self.position, self.velocity, self.acceleration))
+        dv = self.acceleration.take(k + 1, axis=0) - v
+        position = q + (step * s) * w + (step**2 * s**2 / 2) * v + (step**2 * (s**3 / 6 + s / 12)) * dv
+        velocity = w + (step * s) * v + (step * s**2 / 2) * dv
+        return position, velocity, v + s * dv
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""

@@ -300,6 +300,33 @@ def test_nan_entries_fail_whatever_they_compare_with():
             assert not AuditEntry("torque", worst, bound, at_least, tolerance, "", 0.0).ok
 
 
+def test_what_is_past_is_not_looked_at(plan, targets, task):
+    """Fingers that close too fast count until they have closed, and no longer."""
+    strict = TASKS["gripper_velocity"](task, plan)
+    fastest = audit(plan, targets, strict)["gripper_velocity"].time
+    assert plan.phase_ends[0] < fastest < plan.phase_ends[1]
+    for since, failed in (
+        (-np.inf, ["gripper_velocity"]),
+        (plan.phase_ends[0] - 0.2, ["gripper_velocity"]),
+        (fastest - 0.02, ["gripper_velocity"]),
+        (fastest + 0.05, []),
+        (plan.phase_ends[1], []),
+    ):
+        report = audit(plan, targets, strict, since=float(since))
+        assert [entry.name for entry in report.failures] == failed
+        assert ("funnel" in [entry.name for entry in report.entries]) == (since < plan.phase_ends[0])
+        of_the_whole_plan = {"dynamics", "join_position", "join_velocity"}
+        assert all(entry.time >= since for entry in report.entries if entry.name not in of_the_whole_plan)
+
+
+def test_only_the_delivery_is_left(plan, targets, task):
+    report = audit(plan, targets, task, since=float(plan.phase_ends[1]) + 0.1)
+    assert report.ok
+    names = {entry.name for entry in report.entries}
+    assert not names & {"funnel", "grasp_axis", "grasp_dip", "grasp_tilt", "pregrasp_position", "grasp_angle"}
+    assert {"torque", "hold", "place_position", "part_clearance", "carried_clearance"} <= names
+
+
 def test_a_part_elsewhere_is_noticed(plan, targets, task):
     """The boundary states rest on where the part is said to be, not on what the plan says of it."""
     elsewhere = targets.T_world_object.copy()

@@ -261,7 +261,7 @@ class SrsKinematics:
         at, branch = at[first], branch[first]
         rows = np.arange(at.size)
         psi, best_q, best = grid[at], q[at, branch], cost[at, branch]
-        offsets = np.linspace(-1.0, 1.0, 17)
+        offsets = np.linspace(-1.0, 1.0, 65)
         while step > 1e-9:
             trial = psi[:, None] + step * offsets
             q, cost = evaluate(trial.ravel(), np.repeat(branch, offsets.size))
@@ -271,7 +271,12 @@ class SrsKinematics:
             psi = np.where(better, trial[rows, pick], psi)
             best_q = np.where(better[:, None], q[rows, pick], best_q)
             best = np.where(better, cost[rows, pick], best)
-            step /= 6.0  # wider than the spacing of 1/8: noise near the minimum cannot push it out of the next window
+            if step < 1e-2 and best.size > 1:
+                # By now all that is left to gain is far below this.
+                wins = best <= 1.05 * best.min() + 1e-9
+                psi, branch, best_q, best = psi[wins], branch[wins], best_q[wins], best[wins]
+                rows = np.arange(best.size)
+            step /= 25.0  # wider than the spacing of 1/32: noise near the minimum cannot push it out of the next window
         return best_q[best.argmin()]
 
     def _forbidden(self, count: int) -> OutOfReach:

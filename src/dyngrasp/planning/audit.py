@@ -92,7 +92,7 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float 
         plan: Any plan, whoever made it.
         targets: The boundary states and the grasp that it was made for.
         task: Arm, gripper, part and settings.
-        since: What comes before this time (s) is past and not looked at; at the latest the end of the grasp.
+        since: What comes before this time (s) is past and not looked at; before the end of the plan.
 
     Returns:
         One entry a constraint, each with the worst value, its bound and its time. A plan that fails one must not be
@@ -226,6 +226,9 @@ def _boundaries(
 
 def _seen_from_grasp(R: Array, G: Array, times: Array, targets: GraspTargets) -> tuple[Array, Array]:
     """G (M, 3) in the grasp frame where the part is at each time, and the angle of the hand against it (M,)."""
+    if not targets.moving:
+        T = targets.T_world_grasp
+        return (G - T.translation) @ T.rotation, _angles(R, T.rotation)
     R_part, p_part = targets.part_poses(times)
     R_grasp = R_part @ targets.grasp.T_object_grasp.rotation
     origin = p_part + R_part @ targets.grasp.T_object_grasp.translation
@@ -271,6 +274,8 @@ def _funnel(G: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
 
 def _reversal(G: Array, angles: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
     """G stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes."""
+    if not times.size:
+        return []
     settings = task.settings
     lateral = np.hypot(G[:, 0], G[:, 1])
     return [
