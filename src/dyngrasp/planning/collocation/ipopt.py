@@ -113,29 +113,30 @@ class IpoptSolver:
         key = transcription.structure_key(problem)
         if key not in self._solvers:
             program = transcription.build(problem)
-            settings = self.settings
-            options = {
-                "grad_f": program.grad_f,
-                "jac_g": program.jac_g,
-                "hess_lag": program.hess_lag,
-                "error_on_fail": False,
-                "print_time": False,
-                "show_eval_warnings": False,
-                "calc_lam_p": False,
-                "ipopt": {
-                    "print_level": 0,
-                    "sb": "yes",
-                    "linear_solver": settings.linear_solver,
-                    "max_iter": settings.max_iterations,
-                    "max_wall_time": settings.time_limit,
-                    "tol": settings.tolerance,
-                    "mu_init": settings.initial_barrier,
-                    # Rows come scaled by `NodeConstraint.scale`; IPOPT's own rule looks at the first gradients alone.
-                    "nlp_scaling_method": "none",
-                },
-            }
-            self._solvers[key] = program, ca.nlpsol("phase", "ipopt", program.problem, options)
+            derivatives = {"grad_f": program.grad_f, "jac_g": program.jac_g, "hess_lag": program.hess_lag}
+            self._solvers[key] = (
+                program,
+                ca.nlpsol("phase", "ipopt", program.problem, self.options() | derivatives),
+            )
         return self._solvers[key][1]
+
+    def options(self) -> dict[str, object]:
+        """Options of CasADi's interface to IPOPT, but for the derivatives."""
+        settings = self.settings
+        return {
+            "error_on_fail": False,
+            "print_time": False,
+            "show_eval_warnings": False,
+            "ipopt": {
+                "print_level": 0,
+                "sb": "yes",
+                "linear_solver": settings.linear_solver,
+                "max_iter": settings.max_iterations,
+                "max_wall_time": settings.time_limit,
+                "tol": settings.tolerance,
+                "mu_init": settings.initial_barrier,
+            },
+        }
 
 
 def _on_grid(problem: PhaseProblem, guess: Trajectory) -> Trajectory:

@@ -1,0 +1,81 @@
+"""`dyngrasp bench plan`: how long planning takes, and what other solvers take on the same problems."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from dyngrasp.cli.arguments import DELIVERED
+from dyngrasp.experiments.bench_plan import CASES, PEERS, PlanBenchmark, bench_plan
+from dyngrasp.experiments.output import check_writable, write_json
+from dyngrasp.experiments.provenance import machine, versions
+
+
+def bench(options: argparse.Namespace) -> int:
+    """Measure, print the tables, write the JSON. A benchmark is done and good whatever it found."""
+    console = Console()
+    if options.json:
+        check_writable(options.json)
+    against = tuple(name.strip() for name in options.against.split(",") if name.strip())
+    with console.status("…") as status:
+        found = bench_plan(options.trials, options.seed, tuple(options.rho), against, status.update)
+    for name, words in CASES.items():
+        console.print(f"[bold]{name}[/]: {words}")
+    for name in found.peers:
+        console.print(f"[bold]{name}[/]: {PEERS[name][0]}")
+    for table in tables(found):
+        console.print(table)
+    if options.json:
+        arguments = {"trials": options.trials, "seed": options.seed, "weights": options.rho, "against": against}
+        write_json(
+            options.json,
+            {"benchmark": "plan", "arguments": arguments, "machine": machine(), "versions": versions()}
+            | found.report(),
+        )
+        console.print(f"written to {options.json}")
+    return DELIVERED
+
+
+def tables(found: PlanBenchmark) -> list[Table]:
+    """What the terminal shows."""
+    shown = [
+        _table("Whole plan, ms", found.stage_rows(), ("case", "weight", "stage", "ok", "n", *_TIMES)),
+        _table(
+            "Phases, ms",
+            found.phase_rows(),
+            ("case", "weight", "phase", "solver", "ok", "n", *_TIMES, "iterations", "objective", "worst_violation"),
+        ),
+        _table("Growth, ms", list(found.growth), ("joints", "intervals", "ok", "n", *_TIMES, "iterations")),
+    ]
+    if found.peers:
+        columns = ("both", "only_ours", "only_theirs", "same", "better", "worse", "speedup")
+        shown.insert(2, _table("Against peers", found.comparison_rows(), ("case", "weight", "phase", "peer", *columns)))
+    return shown
+
+
+_TIMES = ("median_ms", "p99_ms", "max_ms")
+
+
+def _table(title: str, rows: list[dict[str, Any]], columns: tuple[str, ...]) -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in columns:
+        words = name.removesuffix("_ms").replace("weight", "ρ").replace("_", " ")
+        table.add_column(words, justify="left" if isinstance(rows[0][name], str) else "right")
+    for row in rows:
+        table.add_row(*(_text(name, row[name]) for name in columns))
+    return table
+
+
+def _text(name: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if name.endswith("_ms"):
+        return f"{value:.2f}"
+    if name == "objective":
+        return f"{value:.5f}"
+    if name == "worst_violation":
+        return f"{value:.1e}"
+    return f"{value:g}" if name in ("weight", "iterations") else f"{value:.0f}"

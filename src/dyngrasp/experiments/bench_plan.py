@@ -1,0 +1,342 @@
+"""How long planning takes: paired problems in one process and one thread, against other solvers of the same ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.errors import DyngraspError, GraspRefused, InvalidProblem, OutOfReach
+from dyngrasp.experiments.serial_chain import serial_chain
+from dyngrasp.experiments.statistics import timing_summary
+from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
+from dyngrasp.models.robot import RobotModel
+from dyngrasp.planning import constraints
+from dyngrasp.planning.collocation.ipopt import IpoptSettings
+from dyngrasp.planning.collocation.ipopt_compiled import CompiledIpoptSolver
+from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
+from dyngrasp.planning.collocation.residuals import worst_violation
+from dyngrasp.planning.collocation.structured import StructuredSolver
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets
+from dyngrasp.planning.problem import PhaseProblem, PhaseSolver, Solution
+from dyngrasp.signals import Array
+from dyngrasp.trajectory import PHASE_NAMES
+
+# The paper's box of poses and start; the target holds the part upright, as in scenarios/static_sdh2.toml.
+BOX_X, BOX_Y = (0.6, 0.7), (-0.1, 0.1)
+START_DEG = (55.0, 39.5, -6.6, -22.0, -36.3, 110.6, 134.0)
+PLACE_DEG = (-45.0, 34.0, 0.0, -53.0, 0.0, 93.0, 90.0)
+
+PEERS: dict[str, tuple[str, Callable[[], PhaseSolver]]] = {
+    "ipopt": (
+        "IPOPT with MUMPS, exact compiled derivatives, the planner's start, mu_init = 1e-4, at most 300 iterations",
+        lambda: CompiledIpoptSolver(IpoptSettings(max_iterations=300)),
+    )
+}
+"""Solvers to compare with: what each is given, and how to make it."""
+
+CASES = {
+    "paper": "the paper's start configuration and box of poses",
+    "stress": "random start postures, half of the torque limits",
+}
+
+# Objectives that differ by less are those of one optimum (relative).
+SAME = 1e-5
+GRIDS = (50, 100, 200, 400, 800)
+JOINTS = (4, 5, 6, 7, 8, 9)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One phase of one trial by one solver."""
+
+    case: str
+    weight: float
+    trial: int
+    phase: str
+    solver: str
+    time_ms: float
+    iterations: int
+    objective: float
+    violation: float
+    ok: bool
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Wall time of a part of planning, or of all of it ("plan"), in one trial by the default solver."""
+
+    case: str
+    weight: float
+    trial: int
+    stage: str
+    time_ms: float
+    ok: bool
+
+
+@dataclass(frozen=True)
+class PlanBenchmark:
+    """Everything measured; `table` and `report` condense it."""
+
+    attempts: tuple[Attempt, ...]
+    stages: tuple[Stage, ...]
+    growth: tuple[dict[str, Any], ...]
+    peers: tuple[str, ...]
+
+    def report(self) -> dict[str, Any]:
+        """Summaries for JSON: stages and phases by case and weight, comparisons with peers, growth."""
+        return {
+            "cases": CASES,
+            "peers": {name: PEERS[name][0] for name in self.peers},
+            "stages": self.stage_rows(),
+            "phases": self.phase_rows(),
+            "comparisons": self.comparison_rows(),
+            "growth": list(self.growth),
+        }
+
+    def stage_rows(self) -> list[dict[str, Any]]:
+        """Times of each stage of a whole plan."""
+        groups: dict[tuple, list[Stage]] = {}
+        for stage in self.stages:
+            groups.setdefault((stage.case, stage.weight, stage.stage), []).append(stage)
+        return [
+            {"case": case, "weight": weight, "stage": name, "ok": sum(s.ok for s in group)}
+            | timing_summary([s.time_ms for s in group])
+            for (case, weight, name), group in groups.items()
+        ]
+
+    def phase_rows(self) -> list[dict[str, Any]]:
+        """Times, iterations, objectives and violations of each phase by each solver."""
+        groups: dict[tuple, list[Attempt]] = {}
+        for attempt in self.attempts:
+            groups.setdefault((attempt.case, attempt.weight, attempt.phase, attempt.solver), []).append(attempt)
+        rows = []
+        for (case, weight, phase, solver), group in groups.items():
+            solved = [a for a in group if a.ok]
+            rows.append(
+                {"case": case, "weight": weight, "phase": phase, "solver": solver, "ok": len(solved)}
+                | timing_summary([a.time_ms for a in group])
+                | {
+                    "iterations": float(np.median([a.iterations for a in group])),
+                    "objective": float(np.mean([a.objective for a in solved])) if solved else np.nan,
+                    "worst_violation": max((a.violation for a in solved), default=np.nan),
+                }
+            )
+        return rows
+
+    def comparison_rows(self) -> list[dict[str, Any]]:
+        """The default solver against each peer on the problems that both solved."""
+        by_problem: dict[tuple, dict[str, Attempt]] = {}
+        for a in self.attempts:
+            by_problem.setdefault((a.case, a.weight, a.phase, a.trial), {})[a.solver] = a
+        rows = []
+        for peer in self.peers:
+            groups: dict[tuple, list[tuple[Attempt, Attempt]]] = {}
+            for (case, weight, phase, _), solvers in by_problem.items():
+                if peer in solvers:
+                    groups.setdefault((case, weight, phase), []).append((solvers["structured"], solvers[peer]))
+            for (case, weight, phase), pairs in groups.items():
+                both = [(ours, theirs) for ours, theirs in pairs if ours.ok and theirs.ok]
+                change = np.array([ours.objective / theirs.objective - 1 for ours, theirs in both])
+                rows.append(
+                    {
+                        "case": case,
+                        "weight": weight,
+                        "phase": phase,
+                        "peer": peer,
+                        "problems": len(pairs),
+                        "both": len(both),
+                        "only_ours": sum(ours.ok and not theirs.ok for ours, theirs in pairs),
+                        "only_theirs": sum(theirs.ok and not ours.ok for ours, theirs in pairs),
+                        "same": int((np.abs(change) <= SAME).sum()),
+                        "better": int((change < -SAME).sum()),
+                        "worse": int((change > SAME).sum()),
+                        "speedup": float(np.median([theirs.time_ms / ours.time_ms for ours, theirs in pairs])),
+                    }
+                )
+        return rows
+
+
+def bench_plan(
+    trials: int,
+    seed: int,
+    weights: tuple[float, ...] = (1.0, 1e-3),
+    against: tuple[str, ...] = (),
+    progress: Callable[[str], None] = lambda text: None,
+) -> PlanBenchmark:
+    """Measure planning.
+
+    Args:
+        trials: Poses, and as many postures in the stress case.
+        seed: Of the poses and postures.
+        weights: Effort weights ρ.
+        against: Names in `PEERS`.
+        progress: Told what is measured next.
+
+    Raises:
+        DyngraspError: A peer that is not known.
+    """
+    unknown = [name for name in against if name not in PEERS]
+    if unknown:
+        raise DyngraspError(f"no solver called {unknown[0]!r} to compare with; valid: {', '.join(PEERS)}")
+    task = GraspTask(load_robot("iiwa14"), load_gripper("sdh2"), load_object("casting"), np.deg2rad(PLACE_DEG))
+    solvers: dict[str, PhaseSolver] = {"structured": StructuredSolver()}
+    solvers |= {name: PEERS[name][1]() for name in against}
+    attempts: list[Attempt] = []
+    stages: list[Stage] = []
+    for case in CASES:
+        for weight in weights:
+            fraction = 0.5 if case == "stress" else CollocationSettings().torque_fraction
+            settings = CollocationSettings(effort_weight=weight, torque_fraction=fraction)
+            planner = CollocationPlanner(task, settings, solvers["structured"])
+            for trial, (T, q_start) in enumerate(_draws(case, task, planner, trials, seed)):
+                if trial == 0:
+                    progress(f"{case}, ρ = {weight:g}: compiling what is missing")
+                    _phases(case, weight, 0, planner, T, q_start, task, solvers)
+                progress(f"{case}, ρ = {weight:g}: {trial + 1} of {trials}")
+                stages += _plan(case, weight, trial, planner, T, q_start, task)
+                attempts += _phases(case, weight, trial, planner, T, q_start, task, solvers)
+    progress("growth with N and with the number of joints")
+    growth = tuple(_growth(solvers["structured"], min(trials, 20), seed))
+    return PlanBenchmark(tuple(attempts), tuple(stages), growth, tuple(against))
+
+
+def _draws(
+    case: str, task: GraspTask, planner: CollocationPlanner, trials: int, seed: int
+) -> Iterator[tuple[pin.SE3, Array]]:
+    """Poses within reach and start configurations from which the arm can begin; the same whatever the weight."""
+    drawn = 0
+    for index in range(50 * trials):
+        if drawn == trials:
+            return
+        random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(list(CASES).index(case), index)))
+        x, y, yaw = random.uniform(*BOX_X), random.uniform(*BOX_Y), random.uniform(-np.pi, np.pi)
+        T = pin.SE3(pin.utils.rotate("z", yaw), np.array([x, y, task.grasp_object.rest_height]))
+        q_start = np.deg2rad(START_DEG)
+        if case == "stress":
+            lower, upper = task.robot.limits.position_lower, task.robot.limits.position_upper
+            q_start = random.uniform(0.7 * lower, 0.7 * upper)
+        try:
+            if _can_begin(planner, grasp_targets(T, task, q_start), q_start):
+                drawn += 1
+                yield T, q_start
+        except (OutOfReach, GraspRefused, InvalidProblem):
+            continue
+    raise DyngraspError(f"{case}: only {drawn} of {trials} draws give a problem")
+
+
+def _can_begin(planner: CollocationPlanner, targets: GraspTargets, q_start: Array) -> bool:
+    """Whether arm and hand stand above the ground at the start, the arm with torque to spare at both ends."""
+    task, settings = planner.task, planner.settings
+    T = task.robot.forward_kinematics(q_start)
+    if T.translation[2] < 0.3:
+        return False
+    limits = task.robot.limits
+    available = 0.95 * (settings.torque_fraction * limits.torque - limits.coriolis)
+    loaded, empty = task.robot_loaded(targets.grasp), task.robot_empty
+    held = (
+        (empty, q_start),
+        (empty, targets.pregrasp.position),
+        (loaded, targets.grasped.position),
+        (loaded, task.place),
+    )
+    return all((np.abs(robot.gravity_torque(q)) < available).all() for robot, q in held)
+
+
+def _plan(
+    case: str, weight: float, trial: int, planner: CollocationPlanner, T: pin.SE3, q_start: Array, task: GraspTask
+) -> list[Stage]:
+    """One whole plan as a user gets it, from the pose to the audited plan."""
+    began = time.perf_counter()
+    targets = grasp_targets(T, task, q_start)
+    found = time.perf_counter()
+    result = planner.plan(q_start, targets)
+    done = time.perf_counter()
+    times = {"targets": 1e3 * (found - began)} | {k: v for k, v in result.timings_ms.items() if k != "total"}
+    times["rest"] = 1e3 * (done - began) - sum(times.values())
+    times["plan"] = 1e3 * (done - began)
+    return [Stage(case, weight, trial, name, value, result.ok) for name, value in times.items()]
+
+
+def _phases(
+    case: str,
+    weight: float,
+    trial: int,
+    planner: CollocationPlanner,
+    T: pin.SE3,
+    q_start: Array,
+    task: GraspTask,
+    solvers: dict[str, PhaseSolver],
+) -> list[Attempt]:
+    """The three phases by every solver, each from the same start."""
+    targets = grasp_targets(T, task, q_start)
+    attempts = []
+    for phase, problem in zip(PHASE_NAMES, planner.phase_problems(q_start, targets), strict=True):
+        guess = planner.guess(problem, targets)
+        for name, solver in solvers.items():
+            began = time.perf_counter()
+            solution = solver.solve(problem, guess)
+            elapsed = 1e3 * (time.perf_counter() - began)
+            attempts.append(_attempt(case, weight, trial, phase, name, elapsed, problem, solution))
+    return attempts
+
+
+def _attempt(
+    case: str,
+    weight: float,
+    trial: int,
+    phase: str,
+    solver: str,
+    time_ms: float,
+    problem: PhaseProblem,
+    solution: Solution,
+) -> Attempt:
+    # The violation is measured here for every solver alike, not taken from what it says.
+    violation = np.inf if solution.trajectory is None else worst_violation(problem, solution.trajectory)[0]
+    numbers = (time_ms, solution.iterations, solution.objective, violation)
+    return Attempt(case, weight, trial, phase, solver, *numbers, solution.ok)
+
+
+def _growth(solver: PhaseSolver, trials: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Nearly time-optimal motions of generated arms under torque rows: more grid points, more joints."""
+    for intervals in GRIDS:
+        yield _growth_row(solver, serial_chain(7), intervals, trials, seed)
+    for joints in JOINTS:
+        yield _growth_row(solver, serial_chain(joints), 100, trials, seed)
+
+
+def _growth_row(solver: PhaseSolver, robot: RobotModel, intervals: int, trials: int, seed: int) -> dict[str, Any]:
+    rows = (constraints.torque_rows(robot, intervals),)
+    times, iterations, ok = [], [], 0
+    for trial in range(-1, trials):
+        random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(len(CASES), trial + 1)))
+        limits = robot.limits
+        ends = random.uniform(0.6 * limits.position_lower, 0.6 * limits.position_upper, (2, robot.n))
+        rest = np.zeros(robot.n)
+        problem = PhaseProblem(
+            name="growth",
+            start_position=ends[0],
+            start_velocity=rest,
+            end_position=ends[1],
+            end_velocity=rest,
+            position_lower=limits.position_lower,
+            position_upper=limits.position_upper,
+            velocity_limit=limits.velocity,
+            acceleration_limit=limits.acceleration,
+            constraints=rows,
+            intervals=intervals,
+            effort_weight=1e-3,
+        )
+        solution = solver.solve(problem)
+        if trial < 0:
+            continue  # the first one compiles
+        times.append(solution.timings_ms["total"])
+        iterations.append(solution.iterations)
+        ok += solution.ok
+    return {"joints": robot.n, "intervals": intervals, "ok": ok, "iterations": float(np.median(iterations))} | (
+        timing_summary(times)
+    )
