@@ -14,6 +14,7 @@ _no_replan: dict[str, Any] = {
     "action": "append_const",
     "const": "replanner.enabled=false",
     "dest": "overrides",
+    "default": [],
     "help": "keep the first plan whatever becomes known of the pose, for comparison",
 }
 _SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"
