@@ -101,7 +101,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Funnel:
-    """The inverted Gaussian of eq. (6) in the grasp frame: threshold height and standard deviations (m)."""
+    """The inverted Gaussian of eq. (5) in the grasp frame: threshold height and standard deviations (m)."""
 
     z_threshold: float
     sigma_x: float

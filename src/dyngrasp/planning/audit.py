@@ -263,7 +263,7 @@ def _off_centre(q: Array, lower: Array, upper: Array) -> Array:
 
 
 def _funnel(G: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
-    """h(q) of eq. (7): the height of G (M, 3) in the grasp frame above the inverted Gaussian of eq. (6)."""
+    """h(q) of eq. (6): the height of G (M, 3) in the grasp frame above the inverted Gaussian of eq. (5)."""
     if not times.size:
         return []
     funnel = task.grasp_object.funnel

@@ -51,7 +51,7 @@ def torque_rows(robot: RobotModel, intervals: int, fraction: float = 1.0) -> Nod
 def funnel(
     robot: RobotModel, p_flange_grasp: ArrayLike, T_world_grasp: pin.SE3, shape: Funnel, margin: float = 0.0
 ) -> NodeConstraint:
-    """G stays above the inverted Gaussian, eqs. (6) and (7): h = z − z_th (1 − exp(−½ (x²/σx² + y²/σy²))) ≥ 0.
+    """G stays above the inverted Gaussian, eqs. (5) and (6): h = z − z_th (1 − exp(−½ (x²/σx² + y²/σy²))) ≥ 0.
 
     Above z_th it holds by itself, so that one row serves the whole approach. Equivalent rows with a gentler wall (h
     over the length of its gradient, logarithms) converge worse, see decision 0003; what h needs is a start that already

@@ -27,7 +27,7 @@ class TaskSettings:
     Attributes:
         pregrasp_distance: Height of G above the grasp frame where the approach ends (m; the paper draws about 20 mm).
         approach_speed: Speed of G along the approach axis at the pre-grasp (m/s).
-        lift_speed: Speed of the closed hand along world z at the end of the grasp (m/s), ≥ 0 by eq. (9).
+        lift_speed: Speed of the closed hand along world z at the end of the grasp (m/s), ≥ 0 by eq. (7).
         swivel_rate: Least arm-angle rate through both ends of the grasp (rad/s). The reversal from approach to lift
             would stop every joint at the same instant; a redundant arm keeps moving by this null-space motion.
         swivel_speed_ratio: Least max-norm of q̇/q̇max that the null-space motion alone must give; raises the swivel
