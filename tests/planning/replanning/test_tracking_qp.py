@@ -195,17 +195,17 @@ def kkt_residuals(p, solution):
     return np.abs(residual).max() / np.abs(gradient).max(), float(-g.min()), float(-lam.min() / np.abs(lam).max())
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     move=st.floats(0.0, 0.3),
-    speed_share=st.floats(0.6, 3.0),
+    speed_share=st.floats(0.5, 1.1),
     held_start=st.booleans(),
 )
 def test_kkt_conditions_of_the_exact_program(seed, move, speed_share, held_start):
     reference = motion(N=10, n=2, seed=seed)
     moving = reference.velocity
-    bound = max(speed_share * np.abs(moving).max(), 1.2 * np.abs(moving[[0, -1]]).max() + 0.2 * move)
+    bound = max(speed_share * np.abs(moving).max(), 1.02 * np.abs(moving[[0, -1]]).max() + 0.2 * move)
     # Starting at rest in acceleration keeps the program quadratic: T² q̈ at the splice is treated by two linear passes.
     p = problem(reference, move=move, speed=bound, held=(held_start, False), seed=seed)
     p.start[2] = 0.0

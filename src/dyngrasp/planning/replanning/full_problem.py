@@ -124,3 +124,9 @@ class FullProblem:
             return solution.trajectory, ""
         motion = hold_start(solution.trajectory, state.arm, targets.pregrasp, self.task, self.settings)
         return motion, "" if motion is not None else "the acceleration at the splice cannot be met"
+
+
+def raised(problem: PhaseProblem, by: float) -> PhaseProblem:
+    """The approach with the wall of its funnel moved inward by a height (m)."""
+    rows = tuple(replace(row, lower=row.lower + by) if row.name == "funnel" else row for row in problem.constraints)
+    return replace(problem, constraints=rows)

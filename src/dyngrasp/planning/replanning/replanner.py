@@ -12,8 +12,8 @@ import numpy as np
 from dyngrasp.errors import GraspRefused, InvalidProblem, OutOfReach, PlanningFailed
 from dyngrasp.planning.audit import audit
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
-from dyngrasp.planning.problem import AuditReport, PhaseSolver, Status
-from dyngrasp.planning.replanning.full_problem import FullProblem, PhasePlanner
+from dyngrasp.planning.problem import AuditReport, PhaseProblem, PhaseSolver, Status
+from dyngrasp.planning.replanning.full_problem import FullProblem, PhasePlanner, raised
 from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, funnel_recovery
 from dyngrasp.planning.replanning.splice import (
     APPROACH,
@@ -26,7 +26,7 @@ from dyngrasp.planning.replanning.splice import (
 )
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import PoseEstimate
-from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan
+from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, PlanSample
 
 
 class Path(StrEnum):
@@ -50,6 +50,7 @@ class ReplannerSettings:
         finger_clearance: Grasp updates end when the closing gap is within twice this of the part's width (m): from
             then on the fingers meet the part, which moves with them and not with its estimate.
         recovery_share: σ of `funnel_recovery`.
+        rounds: How often the full problem is solved and audited at most.
         settled: A moving part's grasp time is iterated until the predicted part moves less than this (m).
         gate: Whether the audit decides on publication. It does, but where the paper's own method is to be shown as it
             is.
@@ -61,6 +62,7 @@ class ReplannerSettings:
     least_horizon: float = 0.10
     finger_clearance: float = 0.004
     recovery_share: float = 0.6
+    rounds: int = 3
     settled: float = 1e-7
     gate: bool = True
 
@@ -81,7 +83,8 @@ class ReplanResult:
         targets: What the new plan was made for.
         audit: Of the new plan, or of the candidate that failed; None if none was audited.
         recovery: φ_0 of the funnel, 1 where nothing was softened.
-        timings_ms: Wall time of each stage (ms): "targets", "tracking", "audit", "reoptimise", "fresh", "total".
+        timings_ms: Wall time of each stage (ms): "targets", "tracking", "audit", "full", "fresh",
+            "total".
         message: Why the old plan was kept, or why the first ways failed.
         iterations: Of the tracking program's interior point method; 0 where no box was active.
     """
@@ -291,26 +294,48 @@ class _Attempt:
         started = time.perf_counter()
         left = float(self.plan.phase_ends[APPROACH]) - self.splice
         problems, why = self.full.problems(state, left, targets, self.recovery)
-        self._count("reoptimise", started)
-        solved: set[int] = set()
-        plan = candidate
-        while problems is not None:
-            refused = {plan.phase_at(min(entry.time, plan.end_time)) for entry in self.report.failures} - solved
-            if not refused or self._late(self.settings.budget):
-                why = _failures(self.report)
+        self._count("full", started)
+        if problems is None:
+            self.reasons.append(f"full problem: {why}")
+            return None
+        return self._refined(candidate, set(), problems, state, targets, self.settings.budget)
+
+    def _refined(
+        self,
+        plan: GraspPlan,
+        solved: set[int],
+        problems: tuple[PhaseProblem, ...],
+        state: PlanSample,
+        targets: GraspTargets,
+        budget: float,
+    ) -> GraspPlan | None:
+        """Solve what the audit refuses, and audit again, until it refuses nothing or nothing is left to be done.
+
+        Between its grid points a motion may pass the funnel's wall; then the wall is moved by as much as that was.
+        """
+        assert self.full is not None
+        assert self.report is not None
+        why = ""
+        for _ in range(self.settings.rounds):
+            refused = {plan.phase_at(min(entry.time, plan.end_time)) for entry in self.report.failures}
+            if self._late(budget):
+                why = "no time left"
+                break
+            through_wall = [entry for entry in self.report.failures if entry.name == "funnel"]
+            if APPROACH in solved and through_wall:
+                problems = (raised(problems[APPROACH], -1.2 * through_wall[0].worst), *problems[1:])
+            elif refused <= solved:
                 break
             started = time.perf_counter()
-            improved, why = self.full.improve(
-                plan, refused, problems, state, targets, lambda: self._late(self.settings.budget)
-            )
-            self._count("reoptimise", started)
+            improved, why = self.full.improve(plan, refused, problems, state, targets, lambda: self._late(budget))
+            self._count("full", started)
             if improved is None:
                 break
             plan, solved = improved, solved | refused
             self.report = self._audited(plan, targets)
             if self.report.ok:
                 return plan
-        self.reasons.append(f"full problem: {why}")
+        self.reasons.append(f"full problem: {why or _failures(self.report)}")
         return None
 
     def _fresh_or_kept(
@@ -337,7 +362,7 @@ class _Attempt:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
         recovery = funnel_recovery(plan, targets, self.task, splice, self.settings.recovery_share)
-        fresh, why = None, "the hand is beside the part, below the new grasp frame"
+        fresh, problems, why = None, None, "the hand is beside the part, below the new grasp frame"
         if recovery is not None:
             problems, why = self.full.problems(state, left, targets, recovery)
             if problems is not None:
@@ -348,7 +373,11 @@ class _Attempt:
         self.splice, self.recovery = splice, recovery
         self.report = self._audited(fresh, targets)
         if not self.report.ok:
-            return self._kept(Status.AUDIT_FAILED, targets, f"fresh plan: {_failures(self.report)}")
+            assert problems is not None
+            self.reasons.append(f"fresh plan: {_failures(self.report)}")
+            fresh = self._refined(fresh, {APPROACH, GRASP, DELIVER}, problems, state, targets, budget)
+        if fresh is None:
+            return self._kept(Status.AUDIT_FAILED, targets, "")
         return self._published(fresh, targets, Path.FRESH, budget)
 
     def _late(self, budget: float) -> bool:

@@ -1,0 +1,94 @@
+"""Updated targets against forward kinematics, and that the posture follows the part without a jump."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dyngrasp.errors import OutOfReach
+from dyngrasp.models.inverse_kinematics import inverse_kinematics_for
+from dyngrasp.planning.grasp_targets import moved
+from dyngrasp.planning.replanning.target_update import TargetUpdater, updated_targets
+
+MOVES = {"x": st.floats(-0.04, 0.04), "y": st.floats(-0.04, 0.04), "turn": st.floats(-0.3, 0.3)}
+
+
+def displaced(T, x, y, turn):
+    return pin.SE3(pin.utils.rotate("z", turn) @ T.rotation, T.translation + np.array([x, y, 0.0]))
+
+
+def grasp_frame(task, q, posture):
+    gripper = task.gripper
+    return task.robot.forward_kinematics(q) * gripper.T_flange_hand * gripper.T_hand_grasp(posture)
+
+
+@settings(max_examples=40, deadline=None)
+@given(**MOVES)
+def test_hand_comes_to_the_new_pose_by_the_same_branch_and_arm_angle(task, targets, x, y, turn):
+    T = displaced(targets.T_world_object, x, y, turn)
+    new = updated_targets(targets, T, task)
+    above = pin.SE3(np.eye(3), np.array([0.0, 0.0, task.settings.pregrasp_distance]))
+    T_grasp = T * targets.grasp.T_object_grasp
+    kinematics = inverse_kinematics_for(task.robot)
+    for old, state, wanted, posture in (
+        (targets.grasped, new.grasped, T_grasp, targets.gripper_closed),
+        (targets.pregrasp, new.pregrasp, T_grasp * above, targets.gripper_open),
+    ):
+        # closed form: rounding of some turns of trigonometry
+        assert np.abs(pin.log6(wanted.actInv(grasp_frame(task, state.position, posture))).vector).max() < 1e-9
+        assert kinematics.branch(state.position) == kinematics.branch(old.position)
+        assert abs(kinematics.arm_angle(state.position) - kinematics.arm_angle(old.position)) < 1e-9
+
+
+@settings(max_examples=25, deadline=None)
+@given(**MOVES)
+def test_small_moves_of_the_part_are_small_moves_of_the_arm(task, targets, x, y, turn):
+    T = targets.T_world_object
+    previous = targets
+    for share in (0.25, 0.5, 0.75, 1.0):
+        new = updated_targets(previous, displaced(T, share * x, share * y, share * turn), task)
+        step = np.hypot(x, y) / 4 / 0.15 + abs(turn) / 4 + 1e-9
+        # 0.15 m: no joint of this arm at this posture has a shorter lever; the factor is its dexterity
+        assert np.abs(new.grasped.position - previous.grasped.position).max() < 3 * step
+        assert np.abs(new.grasped.velocity - previous.grasped.velocity).max() < 0.5 * (step + 1e-6)
+        previous = new
+
+
+def test_the_same_pose_gives_the_same_targets(task, targets):
+    new = updated_targets(targets, targets.T_world_object, task)
+    for a, b in ((new.pregrasp, targets.pregrasp), (new.grasped, targets.grasped)):
+        assert np.abs(a.position - b.position).max() < 1e-9
+        assert np.abs(a.velocity - b.velocity).max() < 1e-8
+    assert new.place is targets.place
+
+
+def test_hand_moves_with_a_moving_part_and_lifts(task, targets):
+    twist = np.array([0.05, -0.03, 0.0, 0.0, 0.0, 0.2])
+    duration = 0.6
+    new = TargetUpdater(task).update(targets, targets.T_world_object, twist, 3.0, duration)
+    robot, settings_ = task.robot, task.settings
+    T = new.T_world_object
+    for state, when, own in (
+        (new.grasped, 0.0, np.array([0.0, 0.0, settings_.lift_speed])),
+        (
+            new.pregrasp,
+            -duration,
+            -settings_.approach_speed * (moved(T, twist, -duration) * targets.grasp.T_object_grasp).rotation[:, 2],
+        ),
+    ):
+        flange = robot.forward_kinematics(state.position)
+        velocity = robot.jacobian(state.position) @ state.velocity
+        part = moved(T, twist, when)
+        carried = twist[:3] + np.cross(twist[3:], flange.translation - part.translation)
+        assert np.abs(velocity[:3] - carried - own).max() < 1e-9
+        assert np.abs(velocity[3:] - twist[3:]).max() < 1e-9
+    before = new.T_world_object_at(3.0 - duration) * targets.grasp.T_object_grasp
+    above = pin.SE3(np.eye(3), np.array([0.0, 0.0, settings_.pregrasp_distance]))
+    hand = grasp_frame(task, new.pregrasp.position, targets.gripper_open)
+    assert np.abs(pin.log6((before * above).actInv(hand)).vector).max() < 1e-9
+
+
+def test_out_of_reach_is_refused(task, targets):
+    with pytest.raises(OutOfReach):
+        updated_targets(targets, displaced(targets.T_world_object, 1.0, 0.0, 0.0), task)
