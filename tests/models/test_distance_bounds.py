@@ -1,6 +1,6 @@
 """Bounds are bounds: never above Coal's exact distance, for every kind of body, at rest and along motions."""
 
-import coal
+import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -3,7 +3,7 @@
 import copy
 from dataclasses import replace
 
-import coal
+import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -73,14 +73,14 @@ def perturbed(trajectory: Trajectory, direction, start=(0.0, 0.0), end=(0.0, 0.0
     if middle is not None:
         rows.append(position[N // 2])
         wanted.append(middle - start[0] - N // 2 * step * start[1])
-    v = np.zeros(N + 1)
+    v: np.ndarray = np.zeros(N + 1)
     v[:nodes] = np.linalg.lstsq(np.array(rows)[:, :nodes], np.array(wanted), rcond=None)[0]
     w, q = start[1] + velocity @ v, start[0] + trajectory.times * start[1] + position @ v
     return Trajectory(
         trajectory.duration,
         trajectory.position + np.outer(q, direction),
         trajectory.velocity + np.outer(w, direction),
-        trajectory.acceleration + np.outer(v, direction),
+        trajectory.acceleration + np.outer(v, direction).astype(float),
     )
 
 

@@ -3,7 +3,7 @@
 import itertools
 from dataclasses import replace
 
-import coal
+import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import mujoco
 import numpy as np
 import pinocchio as pin
