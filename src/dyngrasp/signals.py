@@ -23,7 +23,10 @@ def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """
     array = np.array(values, dtype=float, order="C")
     if shape is not None:
-        fits = array.ndim == len(shape) and all(s in (-1, a) for s, a in zip(shape, array.shape, strict=True))
+        # A plain loop: this runs many times in every control period.
+        fits = array.ndim == len(shape)
+        for wanted, size in zip(shape, array.shape, strict=False):
+            fits = fits and wanted in (-1, size)
         if not fits:
             raise ValueError(f"expected shape {shape}, got {array.shape}")
     array.setflags(write=False)

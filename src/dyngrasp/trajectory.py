@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -156,15 +157,15 @@ class GraspPlan:
                         f"{what}: {name} jumps by {jump:.2e} between {PHASE_NAMES[i]} and {PHASE_NAMES[i + 1]}"
                     )
 
-    @property
+    @cached_property
     def durations(self) -> Array:
         """(3,) durations of the phases (s)."""
-        return np.array([phase.duration for phase in self.arm])
+        return read_only([phase.duration for phase in self.arm])
 
-    @property
+    @cached_property
     def phase_ends(self) -> Array:
         """(3,) times T_1, T_2, T_3 at which the phases end, on the common clock (s)."""
-        return self.start_time + np.cumsum(self.durations)
+        return read_only(self.start_time + np.cumsum(self.durations))
 
     @property
     def end_time(self) -> float:
@@ -179,14 +180,13 @@ class GraspPlan:
         """Arm and gripper at time `t` on the common clock, held at the ends of the plan."""
         i = self.phase_at(t)
         local = t - (self.phase_ends[i] - self.durations[i])
-        arm, gripper = self.arm[i].sample(local), self.gripper[i].sample(local)
+        return PlanSample(PHASE_NAMES[i], *(self._state(phases[i], local, t) for phases in (self.arm, self.gripper)))
+
+    def _state(self, trajectory: Trajectory, local: float, t: float) -> JointState:
+        position, velocity, acceleration = (values[0] for values in trajectory.sample_many([local]))
         if t > self.end_time:
-            arm, gripper = _at_rest(arm), _at_rest(gripper)
-        return PlanSample(
-            PHASE_NAMES[i],
-            JointState(t, arm.position, arm.velocity, arm.acceleration),
-            JointState(t, gripper.position, gripper.velocity, gripper.acceleration),
-        )
+            velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
+        return JointState(t, position, velocity, acceleration)
 
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON: per phase times, positions, velocities and accelerations of arm and gripper."""
@@ -239,11 +239,6 @@ class GraspPlan:
             raise PlanFileError(path, str(error.args[0]), None, "is missing") from error
         except (TypeError, ValueError, InvalidTrajectory) as error:
             raise PlanFileError(path, None, None, f"does not hold a plan: {error}") from error
-
-
-def _at_rest(state: JointState) -> JointState:
-    zero = np.zeros_like(state.position)
-    return JointState(state.t, state.position, zero, zero)
 
 
 def _to_json(trajectory: Trajectory) -> dict[str, Any]:
