@@ -92,6 +92,7 @@ def assemble(
 
     G = np.empty((2 * n, 2 * n))  # by (q, v)
     qq, qa, aq, aa = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    run = np.empty((n, TAPS * n))
     ww = np.empty(n)
     qT, wT, aT = np.empty(n), np.empty(n), np.empty(n)
     row_stiffness = np.empty(m)
@@ -173,21 +174,21 @@ def assemble(
 
         for b in range(TAPS):
             q_b, w_b, a_b = taps[k, b, POSITION], taps[k, b, RATE], taps[k, b, CURVATURE]
-            if q_b == 0.0 and w_b == 0.0 and a_b == 0.0:
-                continue
-            row = (first[k] + b) * n
+            col = (first[k] + b) * n
             for i in range(n):
-                column[row + i] += q_b * qT[i] + w_b * wT[i] + a_b * aT[i]
-            for e in range(b + 1):
-                q_e, w_e, a_e = taps[k, e, POSITION], taps[k, e, RATE], taps[k, e, CURVATURE]
-                cqq, cqa, caq, caa = q_b * q_e, q_b * a_e, a_b * q_e, a_b * a_e
-                col = (first[k] + e) * n
+                column[col + i] += q_b * qT[i] + w_b * wT[i] + a_b * aT[i]
+            # Blocks on and below the diagonal in the columns of unknown b, side by side and transposed: the part of
+            # column j from the diagonal down is then one run of band[col + j]. qq and aa are symmetric, qa and aq each
+            # other's transpose.
+            blocks = TAPS - b
+            for e in range(blocks):
+                q_e, w_e, a_e = taps[k, b + e, POSITION], taps[k, b + e, RATE], taps[k, b + e, CURVATURE]
+                cqq, cqa, caq, caa = q_e * q_b, q_e * a_b, a_e * q_b, a_e * a_b
                 for j in range(n):
-                    # Entry (row + i, col + j) lies in band[col + j, row + i − col − j], contiguous in i. The block is
-                    # read by rows of its transpose: qq and aa are symmetric, qa and aq each other's transpose.
-                    start = j if e == b else 0
-                    d = row - col - j
-                    for i in range(start, n):
-                        band[col + j, d + i] += cqq * qq[j, i] + cqa * aq[j, i] + caq * qa[j, i] + caa * aa[j, i]
-                    band[col + j, d + j] += w_b * w_e * ww[j]
+                    for i in range(n):
+                        run[j, e * n + i] = cqq * qq[j, i] + cqa * aq[j, i] + caq * qa[j, i] + caa * aa[j, i]
+                    run[j, e * n + j] += w_e * w_b * ww[j]
+            for j in range(n):
+                for d in range(blocks * n - j):
+                    band[col + j, d] += run[j, j + d]
     return corner

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from dyngrasp.planning.collocation import code_cache
+from dyngrasp.planning.collocation.node_code import HEADER, kernel
 from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.signals import Array
 
@@ -98,9 +99,7 @@ def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, Array
     hessian, _ = ca.hessian(ca.dot(weights, g), u)
     options = {"cse": True}
     values = ca.Function("values", [q, v, p], [g], options)
-    derivatives = ca.Function(
-        "derivatives", [q, v, p, weights], [g, ca.densify(jacobian.T), ca.densify(hessian)], options
-    )
+    derivatives = ca.Function("derivatives", [q, v, p, weights], [g, jacobian.T, hessian], options)
     by_acceleration = np.array(ca.DM(function.jac_sparsity(0, 1), 1.0)).reshape(m, n)
     return values, derivatives, by_acceleration.any(axis=1)
 
@@ -181,40 +180,66 @@ class CompiledNodeFunctions:
         )
 
 
+# A group of grid points is gathered into vectors, evaluated and scattered; the last group may be smaller, its idle
+# lanes repeat the last grid point.
 _LOOPS = """
-void values_over_grid(long long points, const double* q, const double* v, const double* p, double* g,
-                      long long total) {{
-  double w[{work_values} + 1];
-  long long iw[{integers_values} + 1];
-  for (long long k = 0; k < points; ++k) {{
-    const double* in[{arguments_values}] = {{q + k * {n}, v + k * {n}, p + k * {n_p}}};
-    double* out[{results_values}] = {{g + k * total}};
-    values(in, out, iw, w, 0);
+#define GATHER(at, source, size, stride) \\
+  for (int i = 0; i < (size); ++i) \\
+    for (int l = 0; l < LANES; ++l) in[(at) + i][l] = (source)[(k + (l < lanes ? l : lanes - 1)) * (stride) + i];
+
+void values_over_grid(count points, const double* q, const double* v, const double* p, double* g, count total) {{
+  real in[{inputs}], out[{rows}];
+  for (count k = 0; k < points; k += LANES) {{
+    const count lanes = points - k < LANES ? points - k : LANES;
+    GATHER(0, q, {n}, {n}) GATHER({n}, v, {n}, {n}) GATHER({twice}, p, {n_p}, {n_p})
+    values(in, out);
+    for (count l = 0; l < lanes; ++l)
+      for (int i = 0; i < {rows}; ++i) g[(k + l) * total + i] = out[i][l];
   }}
 }}
 
-void derivatives_over_grid(long long points, const double* q, const double* v, const double* p, const double* weights,
-                           double* g, double* jacobian, double* hessian, long long total) {{
-  double w[{work_derivatives} + 1];
-  double curvature[{square}];
-  long long iw[{integers_derivatives} + 1];
-  for (long long k = 0; k < points; ++k) {{
-    const double* in[{arguments_derivatives}] = {{q + k * {n}, v + k * {n}, p + k * {n_p}, weights + k * total}};
-    double* out[{results_derivatives}] = {{g + k * total, jacobian + k * total * {twice}, curvature}};
-    derivatives(in, out, iw, w, 0);
-    for (int i = 0; i < {square}; ++i) hessian[k * {square} + i] += curvature[i];
+static const short jacobian_at[] = {{{jacobian_at}}}, curvature_at[] = {{{curvature_at}}};
+
+void derivatives_over_grid(count points, const double* q, const double* v, const double* p, const double* weights,
+                           double* g, double* jacobian, double* hessian, count total) {{
+  real in[{inputs} + {rows}], out[{outputs}];
+  for (count k = 0; k < points; k += LANES) {{
+    const count lanes = points - k < LANES ? points - k : LANES;
+    GATHER(0, q, {n}, {n}) GATHER({n}, v, {n}, {n}) GATHER({twice}, p, {n_p}, {n_p})
+    GATHER({inputs}, weights, {rows}, total)
+    derivatives(in, out);
+    for (count l = 0; l < lanes; ++l) {{
+      double* here = jacobian + (k + l) * total * {twice};
+      double* curvature = hessian + (k + l) * {twice} * {twice};
+      for (int i = 0; i < {rows}; ++i) g[(k + l) * total + i] = out[i][l];
+      for (int i = 0; i < {rows} * {twice}; ++i) here[i] = 0.0;
+      for (int i = 0; i < {in_jacobian}; ++i) here[jacobian_at[i]] = out[{rows} + i][l];
+      for (int i = 0; i < {in_curvature}; ++i) curvature[curvature_at[i]] += out[{rows} + {in_jacobian} + i][l];
+    }}
   }}
 }}
 """
 
 
 def _source(values: ca.Function, derivatives: ca.Function) -> str:
-    generator = ca.CodeGenerator("node", {"with_header": False})
-    sizes = {"n": values.size1_in(0), "n_p": values.size1_in(2), "twice": 2 * values.size1_in(0)}
-    sizes["square"] = sizes["twice"] ** 2
-    for function in (values, derivatives):
-        generator.add(function)
-        name = function.name()
-        sizes |= {f"work_{name}": function.sz_w(), f"integers_{name}": function.sz_iw()}
-        sizes |= {f"arguments_{name}": function.sz_arg(), f"results_{name}": function.sz_res()}
-    return generator.dump() + _LOOPS.format(**sizes)
+    n, n_p, rows = values.size1_in(0), values.size1_in(2), values.size1_out(0)
+    # Nonzeros by columns; the first output is written transposed, so both orders are that of rows in memory.
+    places = []
+    for output in (1, 2):
+        row, column = derivatives.sparsity_out(output).get_triplet()
+        places.append([c * 2 * n + r for r, c in zip(row, column, strict=True)])
+    numbers = {
+        "n": n,
+        "twice": 2 * n,
+        "n_p": n_p,
+        "rows": rows,
+        "inputs": 2 * n + n_p,
+        "outputs": rows + len(places[0]) + len(places[1]),
+        "in_jacobian": len(places[0]),
+        "in_curvature": len(places[1]),
+        # A list of none is no C; the entry is never read.
+        "jacobian_at": ", ".join(map(str, places[0] or [0])),
+        "curvature_at": ", ".join(map(str, places[1] or [0])),
+    }
+    kernels = kernel(values, "values") + kernel(derivatives, "derivatives")
+    return HEADER + kernels + _LOOPS.format(**numbers)
