@@ -111,7 +111,7 @@ def test_newton_matrix(case):
     rhs = random.normal(size=(2, x.size + 1))
     for r in rhs:
         step = r[:-1].reshape(x.shape).copy()
-        step_T = model.solve(step, r[-1])
+        step_T = model.solve(step, r[-1], np.inf)
         residual = K @ np.append(step.ravel(), step_T) - r
         assert np.abs(residual).max() < 1e-4 * np.abs(r).max()
     assert np.linalg.eigvalsh((K + K.T) / 2)[0] > 0
@@ -148,4 +148,4 @@ def test_fixed_duration_takes_no_step(make_problem):
     multiplier = np.full(model.rows, 0.1)
     model.derivatives(x, 1.5, multiplier, np.empty(model.rows))
     assert model.factorise(multiplier, multiplier, 1.0, 0.0)
-    assert model.solve(x.copy(), 7.0) == 0.0
+    assert model.solve(x.copy(), 7.0, np.inf) == 0.0

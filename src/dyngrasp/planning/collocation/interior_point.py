@@ -36,13 +36,15 @@ ARMIJO = 1e-4
 ROUNDING = 1e-13  # of the merit, relative
 SHORTEST = 1e-10  # step length at which the line search gives up
 SPREAD = 1e10  # multipliers stay within this factor of μ / s, as the convergence proof wants
-LARGEST_CHANGE = 0.7  # of T in one step, relative: 1/T³ knows nothing of the other side of zero
+LARGEST_CHANGE = 0.5  # of T in one step, relative: 1/T³ knows nothing of the other side of zero
 DEARER = 10.0  # factor of ν where it proves too low to enforce the rows
 STATIONARY = 1e-6  # E at a least violation, relative to the price of that violation
 LEAST_CURVATURE = 0.1  # part of the rows' curvature below which it is left out
 CLOSE = 0.3  # share of ν that a multiplier may reach before ν is raised
 DEAREST = 1e6  # largest ν, relative to the objective
-PATIENCE = 40  # iterations within which the violation must fall by the factor PROGRESS
+SLOW = 25  # iterations in monotone mode after which it begins anew with the first barrier parameter
+LONGER = 5  # by how many more the next time
+PATIENCE = 60  # iterations within which the violation must fall by the factor PROGRESS
 PROGRESS = 0.9
 ACCEPTABLE = 1e3  # multiple of the tolerance that counts as solved where rounding allows no further descent
 
@@ -99,6 +101,7 @@ class InteriorPoint:
         self.price = settings.price * self.unit
         self.first_mu = barrier * self.unit
         self.best = Best(self.x.copy(), T)
+        self.slow_limit = SLOW
         self._restart(1.0, 0)
         if multipliers is not None:
             self.mu = settings.warm_barrier * self.unit
@@ -140,6 +143,12 @@ class InteriorPoint:
                 # The cheapest point violates a row: is there any that does not?
                 self._restart(0.0, iteration)
                 continue
+            if settings.adaptive and self.slow >= self.slow_limit:
+                # Close to the bounds the way along a curved valley is short steps; away from them it is not. Each time
+                # the monotone mode gets longer, so that in the end it has as long as it needs.
+                self.slow_limit += LONGER
+                self._restart(model.factor, iteration)
+                continue
             if not self._choose_mode(error, mean):
                 self._undo_step()
             elif self.free:
@@ -161,7 +170,7 @@ class InteriorPoint:
         self.model.values(self.x, self.T, self.g)
         rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
         self.free, self.history, self.reference, self.mean = settings.adaptive, [], np.inf, self.mu
-        self.last_shift = 0.0
+        self.last_shift, self.slow = 0.0, 0
         self.least_violation, self.since = np.inf, iteration
 
     def _violation_stays(self, violation: float, error: float, iteration: int) -> bool:
@@ -181,8 +190,9 @@ class InteriorPoint:
     def _choose_mode(self, error: float, mean: float) -> bool:
         """Decide between the modes; False if the last step was a free one that led astray."""
         if not self.free and error <= self.reference:
-            self.free, self.history = self.settings.adaptive, []
+            self.free, self.history, self.slow = self.settings.adaptive, [], 0
         if not self.free:
+            self.slow += 1
             return True
         if error > FALL * max(self.history[-MEMORY:], default=np.inf):
             self._leave_free_mode()
@@ -245,7 +255,7 @@ class InteriorPoint:
         rows.target_multipliers(*pair, *aim)
         by_T = model.descent(self.y, self.rhs)
         self.dx[:] = self.rhs
-        self.dT = model.solve(self.dx, by_T)
+        self.dT = model.solve(self.dx, by_T, LARGEST_CHANGE * self.T)
         model.row_steps(self.dx, self.dT, self.dg)
         rows.row_direction(self.dg, *pair, *aim, self.ds, self.dt, self.dmultiplier)
         return float(np.vdot(self.rhs, self.dx)) + by_T * self.dT
@@ -253,10 +263,7 @@ class InteriorPoint:
     def _lengths(self, keep: float) -> tuple[float, float]:
         """Lengths of the step of x, T and slacks, and of the step of the multipliers."""
         pair = (self.s, self.t, self.multiplier, self.price)
-        primal, dual = rows.longest_steps(*pair, self.ds, self.dt, self.dmultiplier, keep)
-        if abs(self.dT) * primal > LARGEST_CHANGE * self.T:
-            primal = LARGEST_CHANGE * self.T / abs(self.dT)
-        return primal, dual
+        return rows.longest_steps(*pair, self.ds, self.dt, self.dmultiplier, keep)
 
     def _mehrotra_step(self, mean: float) -> None:
         """Full step to the boundary; the barrier parameter is the cube of what the step for μ = 0 would leave."""

@@ -26,7 +26,7 @@ class InteriorPointSettings:
 
     tolerance: float = 1e-8
     violation_tolerance: float = 1e-9
-    max_iterations: int = 200
+    max_iterations: int = 500
     warm_barrier: float = 1e-5
     least_slack: float = 1e-2
     price: float = 1.0

@@ -152,10 +152,18 @@ class PhaseModel:
         self.complement = banded.schur_complement(work.band, work.column, self.corner, work.solved_column)
         return bool(np.isfinite(self.complement))
 
-    def solve(self, x: Array, by_T: float) -> float:
-        """Overwrite a right-hand side x (N−1, n) by the solution; return its last unknown, the step of T."""
+    def solve(self, x: Array, by_T: float, longest: float) -> float:
+        """Overwrite a right-hand side x (N−1, n) by the solution; return its last unknown, the step of T.
+
+        A step of T beyond `longest` is cut to that and x solved for it: as if the corner had been larger.
+        """
         work = self.work
         if self.limits.fixed_duration:
             banded.solve_in_place(work.band, x.ravel())
             return 0.0
-        return banded.solve_bordered(work.band, work.solved_column, self.complement, x.ravel(), by_T)
+        step = banded.solve_bordered(work.band, work.solved_column, self.complement, x.ravel(), by_T)
+        if abs(step) <= longest:
+            return step
+        cut = np.copysign(longest, step)
+        x.ravel()[:] += (step - cut) * work.solved_column
+        return cut

@@ -43,7 +43,7 @@ class StructuredSettings:
 
     tolerance: float = 1e-8
     violation_tolerance: float = 1e-9
-    max_iterations: int = 200
+    max_iterations: int = 500
     time_limit: float = 5.0
     initial_barrier: float = 1e-3
     guess_barrier: float = 1e-4
