@@ -167,6 +167,8 @@ def bench_plan(
     weights: tuple[float, ...] = (1.0, 1e-3),
     against: tuple[str, ...] = (),
     progress: Callable[[str], None] = lambda text: None,
+    grids: tuple[int, ...] = GRIDS,
+    joints: tuple[int, ...] = JOINTS,
 ) -> PlanBenchmark:
     """Measure planning.
 
@@ -176,6 +178,8 @@ def bench_plan(
         weights: Effort weights ρ.
         against: Names in `PEERS`.
         progress: Told what is measured next.
+        grids: Numbers of intervals N to see growth with.
+        joints: Numbers of joints to see growth with.
 
     Raises:
         DyngraspError: A peer that is not known.
@@ -201,7 +205,7 @@ def bench_plan(
                 stages += _plan(case, weight, trial, planner, T, q_start, task)
                 attempts += _phases(case, weight, trial, planner, T, q_start, task, solvers)
     progress("growth with N and with the number of joints")
-    growth = tuple(_growth(solvers["structured"], min(trials, 20), seed))
+    growth = tuple(_growth(solvers["structured"], min(trials, 20), seed, grids, joints))
     return PlanBenchmark(tuple(attempts), tuple(stages), growth, tuple(against))
 
 
@@ -301,12 +305,15 @@ def _attempt(
     return Attempt(case, weight, trial, phase, solver, *numbers, solution.ok)
 
 
-def _growth(solver: PhaseSolver, trials: int, seed: int) -> Iterator[dict[str, Any]]:
+def _growth(
+    solver: PhaseSolver, trials: int, seed: int, grids: tuple[int, ...], joints: tuple[int, ...]
+) -> Iterator[dict[str, Any]]:
     """Nearly time-optimal motions of generated arms under torque rows: more grid points, more joints."""
-    for intervals in GRIDS:
-        yield _growth_row(solver, serial_chain(7), intervals, trials, seed)
-    for joints in JOINTS:
-        yield _growth_row(solver, serial_chain(joints), 100, trials, seed)
+    seven = serial_chain(7)
+    for intervals in grids:
+        yield _growth_row(solver, seven, intervals, trials, seed)
+    for n in joints:
+        yield _growth_row(solver, serial_chain(n), 100, trials, seed)
 
 
 def _growth_row(solver: PhaseSolver, robot: RobotModel, intervals: int, trials: int, seed: int) -> dict[str, Any]:
