@@ -64,6 +64,14 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     )
     bench_plan.add_argument("--against", metavar="NAMES", default="", help="other solvers, e.g. ipopt")
     bench_plan.add_argument("--json", metavar="FILE", help="write all figures, with machine and versions")
+    bench_replan = benchmarks.add_parser("replan", help="the online program, whole cycles, and the paper's update")
+    bench_replan.add_argument("--cycles", type=_count, metavar="N", default=1000, help="of each kind; default: 1000")
+    bench_replan.add_argument("--seed", type=_seed, metavar="S", default=0, help="draws splices and moves; default: 0")
+    bench_replan.add_argument("--rho", type=_weight, metavar="W", default=1.0, help="effort weight; default: 1")
+    bench_replan.add_argument(
+        "--against", metavar="NAMES", default="", help="general solvers: ipopt, osqp, piqp, piqp_multistage, clarabel"
+    )
+    bench_replan.add_argument("--json", metavar="FILE", help="write all rows, with machine and versions")
 
     commands.add_parser("models", help="list robots, grippers and objects")
 

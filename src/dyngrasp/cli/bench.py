@@ -1,4 +1,4 @@
-"""`dyngrasp bench plan`: how long planning takes, and what other solvers take on the same problems."""
+"""`dyngrasp bench`: how long planning and replanning take, and what other solvers take on the same problems."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from rich.table import Table
 
 from dyngrasp.cli.arguments import DELIVERED
 from dyngrasp.experiments.bench_plan import CASES, PEERS, PlanBenchmark, bench_plan
+from dyngrasp.experiments.bench_replan import bench_replan
 from dyngrasp.experiments.output import check_writable, write_json
 from dyngrasp.experiments.provenance import machine, versions
 
 
 def bench(options: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON. A benchmark is done and good whatever it found."""
+    if options.benchmark == "replan":
+        return _replan(options)
     console = Console()
     if options.json:
         check_writable(options.json)
@@ -35,6 +38,28 @@ def bench(options: argparse.Namespace) -> int:
             {"benchmark": "plan", "arguments": arguments, "machine": machine(), "versions": versions()}
             | found.report(),
         )
+        console.print(f"written to {options.json}")
+    return DELIVERED
+
+
+def _replan(options: argparse.Namespace) -> int:
+    console = Console()
+    if options.json:
+        check_writable(options.json)
+    against = tuple(name.strip() for name in options.against.split(",") if name.strip())
+    with console.status("…") as status:
+        rows = bench_replan(options.cycles, options.seed, options.rho, against, status.update)
+    programs = [row for row in rows if row["case"].startswith("qp_")]
+    cycles = [row for row in rows if row["solver"] == "replanner"]
+    errors = [row for row in rows if row["case"] == "end_point_error"]
+    for title, shown, columns in (
+        ("Quadratic program, ms", programs, ("case", "solver", "n", "solved", *_TIMES)),
+        ("Whole cycle, ms", cycles, ("case", "n", *_TIMES, "published", "kept", "late", "published_invalid", "jumps")),
+        ("Miss at the pre-grasp", errors, ("solver", "duration_weight", "move", "error_mm")),
+    ):
+        console.print(_table(title, shown, columns))
+    if options.json:
+        write_json(options.json, {"rows": rows, "machine": machine(), "versions": versions()})
         console.print(f"written to {options.json}")
     return DELIVERED
 
@@ -73,7 +98,9 @@ def _text(name: str, value: Any) -> str:
     if isinstance(value, str):
         return value
     if name.endswith("_ms"):
-        return f"{value:.2f}"
+        return f"{value:.3f}" if value < 1 else f"{value:.2f}"
+    if name == "error_mm":
+        return f"{value:.2g}"
     if name == "objective":
         return f"{value:.5f}"
     if name == "worst_violation":

@@ -14,9 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from dyngrasp.errors import OutOfReach
-from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
@@ -41,14 +42,20 @@ class DescentSettings:
 
 
 def carried_descent(
-    reference: Trajectory, q_pregrasp: Array, p_flange_grasp: Array, task: GraspTask, settings: DescentSettings
+    reference: Trajectory,
+    start: float,
+    targets: GraspTargets,
+    previous: GraspTargets | None,
+    task: GraspTask,
+    settings: DescentSettings,
 ) -> tuple[Trajectory, Array] | None:
     """The reference with its descent carried along with the part, and the weights of its positions.
 
     Args:
         reference: What is left of the approach.
-        q_pregrasp: (n,) the new pre-grasp (rad).
-        p_flange_grasp: (3,) G of the open hand in the flange frame (m).
+        start: When it begins (s).
+        targets: The new ones.
+        previous: What the running plan was made for; if left out, a part at rest.
         task: Arm, gripper, part.
         settings: How.
 
@@ -56,9 +63,17 @@ def carried_descent(
         Reference and weights (N+1,) in units of Q_v (1/s⁴); None if the arm cannot follow the carried motion.
     """
     robot, updater = task.robot, target_updater(task)
+    q_pregrasp = targets.pregrasp.position
+    p_flange_grasp = task.gripper.T_flange_hand.act(task.gripper.grasp_point(targets.gripper_open))
     N = reference.intervals
     old_end = robot.forward_kinematics(reference.position[-1])
-    shift = robot.forward_kinematics(q_pregrasp) * old_end.inverse()
+    at_end = robot.forward_kinematics(q_pregrasp) * old_end.inverse()
+
+    def shift(k: int) -> pin.SE3:
+        """Where the carried motion is at a grid point, seen from the old one: parts that move were elsewhere then."""
+        now, end = start + k / N * reference.duration, start + reference.duration
+        return _since(targets, now, end) * at_end * _since(previous, now, end).inverse()
+
     axis = old_end.rotation @ updater.approach_axis_in_flange
     lowest = float(axis @ old_end.act(p_flange_grasp)) - task.settings.pregrasp_distance
     top = lowest + settings.height * task.grasp_object.funnel.z_threshold
@@ -76,7 +91,7 @@ def carried_descent(
     knots = np.unique(np.linspace(entry, N, _KNOTS).round().astype(int))
     try:
         carried = [
-            updater.posture(shift * robot.forward_kinematics(reference.position[k]), reference.position[k])
+            updater.posture(shift(k) * robot.forward_kinematics(reference.position[k]), reference.position[k])
             for k in knots[:-1]
         ]
     except OutOfReach:
@@ -94,6 +109,13 @@ def carried_descent(
     weights = np.zeros(N + 1)
     weights[entry:] = (settings.stiffness / ((1 - entry / N) * T)) ** 4
     return Trajectory(T, position, velocity, acceleration), weights
+
+
+def _since(targets: GraspTargets | None, now: float, end: float) -> pin.SE3:
+    """The motion of a part that takes its pose at `end` (s) to that at `now` (s)."""
+    if targets is None or not targets.moving:
+        return pin.SE3.Identity()
+    return targets.T_world_object_at(now) * targets.T_world_object_at(end).inverse()
 
 
 def _lagrange(knots: Array, s: Array) -> tuple[Array, Array, Array]:

@@ -139,19 +139,22 @@ class Replanner:
             self.full = FullProblem(task, planner, solver, self.settings.tracking)
         self._clock = clock
 
-    def replan(self, plan: GraspPlan, targets: GraspTargets, t: float) -> ReplanResult:
+    def replan(
+        self, plan: GraspPlan, targets: GraspTargets, t: float, previous: GraspTargets | None = None
+    ) -> ReplanResult:
         """Continue `plan` to new targets.
 
         Args:
             plan: The running plan, whoever made it.
             targets: New boundary states, best from `updated_targets`: those continue the plan's posture.
             t: Now (s), on the plan's clock.
+            previous: What the running plan was made for, which matters only if the part moved in it.
 
         Returns:
             A new plan that takes over at t + budget, with q, q̇ and q̈ of the old one there; or the old plan with a
             status.
         """
-        return _Attempt(self, plan, t).towards(targets)
+        return _Attempt(self, plan, t).towards(targets, previous=previous)
 
     def replan_to_pose(self, plan: GraspPlan, previous: GraspTargets, estimate: PoseEstimate, t: float) -> ReplanResult:
         """The whole cycle: from an estimate of the part's pose through the inverse kinematics to an audited plan.
@@ -182,12 +185,14 @@ class _Attempt:
         self.recovery: FunnelRecovery | None = None
         self.reasons: list[str] = []
         self.iterations = 0
+        self.previous: GraspTargets | None = None
         self.splice = splice_time(plan, t + self.settings.budget)
 
     def to_pose(self, previous: GraspTargets, estimate: PoseEstimate) -> ReplanResult:
         refusal = self._refusal()
         if refusal:
             return self._kept(Status.INFEASIBLE, previous, refusal)
+        self.previous = previous
         updater, twist = target_updater(self.task), estimate.twist_world
         plan, targets = self.plan, previous
         # A slower part than this moves less than `settled` while the grasp time changes by a second.
@@ -215,9 +220,12 @@ class _Attempt:
             grasp_time, plan = grasp_time + change, candidate.plan
             if abs(change) * float(np.abs(twist).max()) <= self.settings.settled:
                 break
-        return self.towards(targets, estimate)
+        return self.towards(targets, estimate, previous)
 
-    def towards(self, targets: GraspTargets, estimate: PoseEstimate | None = None) -> ReplanResult:
+    def towards(
+        self, targets: GraspTargets, estimate: PoseEstimate | None = None, previous: GraspTargets | None = None
+    ) -> ReplanResult:
+        self.previous = previous
         refusal = self._refusal()
         if refusal:
             return self._kept(Status.INFEASIBLE, targets, refusal)
@@ -273,7 +281,7 @@ class _Attempt:
 
     def _track(self, targets: GraspTargets, way: int = 0) -> Candidate:
         started = time.perf_counter()
-        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking, way)
+        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking, way, self.previous)
         self._count("tracking", started)
         return candidate
 

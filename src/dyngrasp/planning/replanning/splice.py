@@ -96,6 +96,7 @@ def track(
     splice: float,
     settings: TrackingSettings,
     way: int = 0,
+    previous: GraspTargets | None = None,
 ) -> Candidate:
     """Continue a plan from the splice on to new targets.
 
@@ -106,13 +107,14 @@ def track(
         splice: From `splice_time`; before the delivery begins.
         settings: How.
         way: Which of the descents.
+        previous: What the plan was made for; only a moving part makes a difference.
     """
     begun = plan.phase_at(splice)
     solutions: list[TrackingSolution] = []
     arm, hand = list(plan.arm), list(plan.gripper)
     for phase in range(begun, 3):
         if phase == APPROACH:
-            solution, arm[phase], hand[phase] = _approach(plan, targets, task, splice, settings, way)
+            solution, arm[phase], hand[phase] = _approach(plan, targets, task, splice, settings, way, previous)
         elif phase == begun:
             solution, arm[phase] = _rest_of_grasp(plan, targets, task, splice, settings)
         else:
@@ -171,7 +173,13 @@ def hand_needs(trajectory: Trajectory, task: GraspTask) -> float:
 
 
 def _approach(
-    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, settings: TrackingSettings, way: int
+    plan: GraspPlan,
+    targets: GraspTargets,
+    task: GraspTask,
+    splice: float,
+    settings: TrackingSettings,
+    way: int,
+    previous: GraspTargets | None,
 ) -> tuple[TrackingSolution, Trajectory, Trajectory]:
     local = splice - (plan.phase_ends[APPROACH] - plan.durations[APPROACH])
     N, n = plan.arm[APPROACH].intervals, task.robot.n
@@ -179,8 +187,7 @@ def _approach(
     still = not (hand.velocity.any() or hand.acceleration.any())
     weights = None
     if not settings.paper_rows:
-        p_G = task.gripper.T_flange_hand.act(task.gripper.grasp_point(targets.gripper_open))
-        carried = carried_descent(reference, targets.pregrasp.position, p_G, task, settings.descents[way])
+        carried = carried_descent(reference, splice, targets, previous, task, settings.descents[way])
         if carried is not None:
             reference, weights = carried
     problem = _splice_program(reference, plan, targets.pregrasp, splice, task, settings)

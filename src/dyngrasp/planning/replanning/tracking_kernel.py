@@ -28,6 +28,18 @@ NEAR = 0.15
 
 
 @njit(cache=True, error_model="numpy")
+def distinct(codes: Array) -> int:
+    """Sort the codes, put each of them first once, and return how many there are."""
+    codes.sort()
+    count = 0
+    for code in codes:
+        if count == 0 or code != codes[count - 1]:
+            codes[count] = code
+            count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
 def solve(
     reference: Array,
     T_ref: float,
@@ -67,7 +79,7 @@ def solve(
         bands: Of `filters`.
         max_iterations: Of the interior point method.
         z: (3, K, n), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
-        codes: At least 6 K n integers, overwritten by the codes of the rows that were imposed.
+        codes: At least 12 K n integers, overwritten by the codes of the rows that were imposed.
         multipliers: As many floats and two more, overwritten by their multipliers, the last two those of T.
 
     Returns:
@@ -199,7 +211,8 @@ def solve(
         unit = max(cost, 0.5 * (stiffness_T + np.sum(scaled[0])) * outside * outside, 1e-9)
         x_free, z_free, error_free = x.copy(), z.copy(), error.copy()
         T_free, gradient_free = T, gradient_T
-        margin = NEAR
+        margin = NEAR + max(-least, 0.0)
+        count, _ = collect(z, T, T_lin, boxes, rates, margin, a_ends, codes)
         for attempt in range(3):
             x[:], z[:], error[:], T = x_free, z_free, error_free, T_free
             outcome, T, steps = interior_point(
@@ -233,8 +246,13 @@ def solve(
             _, least = collect(z, T, T_lin, boxes, rates, -UNBOUNDED, a_ends, codes[count:])
             if least >= -VIOLATION:
                 break
-            margin = 0.6 if attempt == 0 else np.inf
-            count, _ = collect(z_free, T_free, T_lin, boxes, rates, margin, a_ends, codes)
+            if attempt == 0:
+                # What the free optimum and the one so far come near to; seldom is anything else active in the end.
+                near_free, _ = collect(z_free, T_free, T_lin, boxes, rates, margin, a_ends, codes)
+                near, _ = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes[near_free:])
+                count = distinct(codes[: near_free + near])
+            else:
+                count, _ = collect(z_free, T_free, T_lin, boxes, rates, np.inf, a_ends, codes)
         if outcome == OPTIMAL and least < -VIOLATION:
             outcome = INFEASIBLE
     else:

@@ -169,7 +169,7 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
     np.clip(boxes, -UNBOUNDED, UNBOUNDED, out=boxes)
     first, taps, bands = filters(N, *held, not problem.paper_rows)
     scaled = np.empty((3, N + 1, n))
-    codes = np.empty(6 * (N + 1) * n + 8, dtype=np.int64)
+    codes = np.empty(12 * (N + 1) * n, dtype=np.int64)
     multipliers = np.empty(codes.size + 2)
     outcome, duration, iterations, count = tracking_kernel.solve(
         motion,

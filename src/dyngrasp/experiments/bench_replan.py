@@ -1,0 +1,301 @@
+"""How long replanning takes: the program alone and against others, whole cycles, the defect of the paper's update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.errors import OutOfReach
+from dyngrasp.experiments.bench_plan import PLACE_DEG, START_DEG
+from dyngrasp.experiments.qp_solvers import solver_of
+from dyngrasp.experiments.statistics import timing_summary
+from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
+from dyngrasp.planning.audit import audit
+from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
+from dyngrasp.planning.collocation.structured import StructuredSolver
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
+from dyngrasp.planning.problem import Status
+from dyngrasp.planning.replanning.lcqp import end_point_error, sparse_program
+from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
+from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, rest_of, track
+from dyngrasp.planning.replanning.target_update import updated_targets
+from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingWeights, paper_step, solve_tracking
+from dyngrasp.signals import PoseEstimate
+from dyngrasp.trajectory import GraspPlan
+
+RATE = 10.0  # replans a second in the sequences (Hz)
+
+# Of the program alone: like the paper's, with weight on everything.
+_WEIGHTS = TrackingWeights(0.1, 0.1, 1.0, 100.0)
+
+# With the speed limits at this share of what the motion asks, some twenty rows of the program are active.
+_ACTIVE_SHARE = 0.985
+
+SEQUENCES = ("still", "drift", "step_3cm", "step_5cm", "moving")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A task and the plan from which the replans start."""
+
+    task: GraspTask
+    targets: GraspTargets
+    plan: GraspPlan
+    planner: CollocationPlanner
+
+
+def make_cell(effort_weight: float, yaw: float = 0.3) -> Cell:
+    """The paper's arm, hand and part, planned with a weight ρ.
+
+    Raises:
+        PlanningFailed: There is no valid plan to start from.
+    """
+    robot, gripper, part = load_robot("iiwa14"), load_gripper("sdh2"), load_object("casting")
+    task = GraspTask(robot, gripper, part, np.deg2rad(PLACE_DEG))
+    T = pin.SE3(pin.utils.rotate("z", yaw), np.array([0.65, 0.0, part.rest_height]))
+    q_start = np.deg2rad(START_DEG)
+    planner = CollocationPlanner(task, CollocationSettings(effort_weight=effort_weight))
+    targets = grasp_targets(T, task, q_start)
+    return Cell(task, targets, planner.plan(q_start, targets).require(), planner)
+
+
+def bench_replan(
+    cycles: int,
+    seed: int,
+    effort_weight: float,
+    against: tuple[str, ...] = (),
+    progress: Callable[[str], None] = lambda words: None,
+) -> list[dict[str, Any]]:
+    """All rows of the benchmark.
+
+    Args:
+        cycles: Replans of each kind.
+        seed: Of all draws.
+        effort_weight: ρ of the plan that is replanned.
+        against: Names of general solvers.
+        progress: Told what is measured now.
+    """
+    cell = make_cell(effort_weight)
+    rows: list[dict[str, Any]] = []
+    for case in ("qp_free", "qp_active"):
+        progress(f"{case}: structured")
+        problems = list(qp_problems(cell, case, cycles, seed))
+        rows.append(_structured_row(case, problems))
+        for name in against:
+            progress(f"{case}: {name}")
+            # General solvers take up to a thousand times longer; a few dozen calls tell their median.
+            rows.append(_peer_row(case, name, problems[: min(cycles, 40)]))
+    rows += _cycle_rows(cell, cycles, seed, progress)
+    progress("end point errors of the two updates")
+    rows += end_point_rows(cell, seed)
+    return [row | {"rho": effort_weight} for row in rows]
+
+
+def qp_problems(cell: Cell, case: str, count: int, seed: int) -> Iterator[TrackingProblem]:
+    """Programs of the approach: random splices, the part moved by up to 3 cm and 8°."""
+    rng = np.random.default_rng(seed)
+    task, plan, limits = cell.task, cell.plan, cell.task.robot.limits
+    made = 0
+    while made < count:
+        t = plan.start_time + rng.uniform(0.0, 0.8) * plan.durations[APPROACH]
+        try:
+            targets = updated_targets(cell.targets, _displaced(cell.targets.T_world_object, rng, 0.03, 8.0), task)
+        except OutOfReach:
+            continue
+        reference = rest_of(plan.arm[APPROACH], t - plan.start_time, plan.arm[APPROACH].intervals)
+        state, end = plan.sample(t).arm, targets.pregrasp
+        speed = limits.velocity
+        if case == "qp_active":
+            asked = np.abs(reference.velocity).max(axis=0)
+            at_ends = np.maximum(np.abs(state.velocity), np.abs(end.velocity))
+            speed = np.maximum(_ACTIVE_SHARE * asked, 1.02 * at_ends)
+        made += 1
+        yield TrackingProblem(
+            reference,
+            np.stack([state.position, state.velocity, state.acceleration]),
+            np.stack([end.position, end.velocity, reference.acceleration[-1]]),
+            True,
+            True,
+            limits.position_lower,
+            limits.position_upper,
+            speed,
+            limits.acceleration,
+            0.3 * reference.duration,
+            3.0 * reference.duration,
+            _WEIGHTS,
+            paper_rows=True,
+        )
+
+
+def _structured_row(case: str, problems: list[TrackingProblem]) -> dict[str, Any]:
+    solve_tracking(problems[0])
+    solutions = [solve_tracking(problem) for problem in problems]
+    active = [int((s.multipliers[:-2] > 1e-6).sum()) if s.iterations else 0 for s in solutions]
+    return {
+        "solver": "structured",
+        "case": case,
+        **timing_summary([s.elapsed_ms for s in solutions]),
+        "solved": sum(s.status is Status.CONVERGED for s in solutions),
+        "active_rows": float(np.median(active)),
+    }
+
+
+def _peer_row(case: str, name: str, problems: list[TrackingProblem]) -> dict[str, Any]:
+    solve = solver_of(name)
+    if solve is None:
+        return {"solver": name, "case": case, **timing_summary([]), "solved": 0, "note": "not installed"}
+    times, differences = [], []
+    for problem in problems:
+        ours = solve_tracking(problem)
+        x, elapsed = solve(sparse_program(problem))
+        times.append(elapsed)
+        if ours.status is Status.CONVERGED and np.isfinite(x).all():
+            differences.append(float(np.abs(paper_step(problem, ours).ravel() - x).max()))
+    return {
+        "solver": name,
+        "case": case,
+        **timing_summary(times),
+        "solved": len(differences),
+        "difference_median": float(np.median(differences)) if differences else float("nan"),
+    }
+
+
+def _cycle_rows(cell: Cell, cycles: int, seed: int, progress: Callable[[str], None]) -> list[dict[str, Any]]:
+    replanner = Replanner(cell.task, None, StructuredSolver(), cell.planner)
+    rng = np.random.default_rng([seed, 1])
+    for sequence in SEQUENCES:
+        # What is compiled or loaded at a first call is no part of a cycle.
+        list(_sequence(cell, replanner, sequence, rng))
+    counted: dict[str, list[float]] = {}
+    outcome: dict[str, dict[str, int]] = {}
+    for sequence in SEQUENCES:
+        done = 0
+        while done < cycles // len(SEQUENCES):
+            for result, running in _sequence(cell, replanner, sequence, rng):
+                done += 1
+                for case in (sequence, _case_of(result)):
+                    counted.setdefault(case, []).append(result.timings_ms["total"])
+                    counts = outcome.setdefault(
+                        case, {"published": 0, "published_invalid": 0, "late": 0, "kept": 0, "jumps": 0}
+                    )
+                    counts["published"] += result.ok
+                    counts["kept"] += result.path is Path.KEPT
+                    counts["late"] += result.status is Status.DEADLINE_MISSED
+                    counts["published_invalid"] += result.ok and not _valid(result, cell.task)
+                    counts["jumps"] += result.ok and _jump(running, result) > 1e-9
+            progress(f"cycles, {sequence}: {done}")
+    return [
+        {"solver": "replanner", "case": case, **timing_summary(times), **outcome[case]}
+        for case, times in counted.items()
+    ]
+
+
+def _case_of(result: ReplanResult) -> str:
+    free = result.path is Path.TRACKING and result.iterations == 0 and not result.message
+    return "cycle_free" if free else "cycle_constrained"
+
+
+def _sequence(
+    cell: Cell, replanner: Replanner, kind: str, rng: np.random.Generator
+) -> Iterator[tuple[ReplanResult, GraspPlan]]:
+    """Replans from the start to the grasp, each from the plan of the one before; with the plan that ran before it."""
+    plan, targets, T = cell.plan, cell.targets, cell.targets.T_world_object
+    twist = np.zeros(6)
+    heading = rng.uniform(-np.pi, np.pi)
+    direction = np.array([np.cos(heading), np.sin(heading), 0.0])
+    if kind == "moving":
+        twist[:3] = 0.03 * direction
+        # Where it has to be now so that the running plan meets it.
+        T = moved(T, twist, -float(plan.phase_ends[1]))
+    end = float(plan.phase_ends[APPROACH])
+    step_at = rng.uniform(0.1, 0.7) * end
+    t, jumped = plan.start_time + rng.uniform(0.0, 1.0 / RATE), False
+    while t < plan.phase_ends[APPROACH] - 0.2:
+        if kind == "drift":
+            T = pin.SE3(T.rotation, T.translation + 0.01 / (RATE * end) * direction)
+        if kind.startswith("step") and not jumped and t >= step_at:
+            jumped = True
+            T = pin.SE3(T.rotation, T.translation + float(kind[5]) * 0.01 * direction)
+        T_now = moved(T, twist, t) if kind == "moving" else T
+        result = replanner.replan_to_pose(plan, targets, PoseEstimate(T_now, 1e-6 * np.eye(6), t, t, twist), t)
+        yield result, plan
+        plan, targets = result.plan, (result.targets if result.ok else targets)
+        t += 1.0 / RATE
+
+
+def _valid(result: ReplanResult, task: GraspTask) -> bool:
+    """The audit once more; what a softened funnel allows is judged by the replanner's own report."""
+    report = audit(result.plan, result.targets, task, result.splice)
+    return all(entry.name == "funnel" and result.recovery < 1.0 for entry in report.failures) and (
+        result.audit is not None and result.audit.ok
+    )
+
+
+def _jump(running: GraspPlan, result: ReplanResult) -> float:
+    a, b = running.sample(result.splice), result.plan.sample(result.splice)
+    return max(
+        float(np.abs(getattr(getattr(a, part), name) - getattr(getattr(b, part), name)).max())
+        for part in ("arm", "gripper")
+        for name in ("position", "velocity", "acceleration")
+    )
+
+
+def end_point_rows(cell: Cell, seed: int) -> list[dict[str, Any]]:
+    """How far the hand would miss the pre-grasp if the accelerations of the updated plan were carried out."""
+    rows: list[dict[str, Any]] = []
+    for stiffness in (1.0, 100.0):
+        weights = TrackingWeights(0.01, 0.01, 1.0, stiffness)
+        for solver in ("lcqp", "exact"):
+            settings = TrackingSettings(weights=weights, paper_rows=solver == "lcqp")
+            for centimetres in (1, 3, 5, 10):
+                error = _miss(cell, settings, [0.01 * centimetres], 0.3, seed)
+                rows.append(_error_row(solver, stiffness, f"{centimetres} cm", error))
+            error = _miss(cell, settings, [0.01] * 20, 0.02, seed)
+            rows.append(_error_row(solver, stiffness, "20 x 1 cm", error))
+    return rows
+
+
+def _error_row(solver: str, stiffness: float, move: str, error: float) -> dict[str, Any]:
+    return {
+        "solver": solver,
+        "case": "end_point_error",
+        "duration_weight": stiffness,
+        "move": move,
+        "error_mm": 1e3 * error,
+    }
+
+
+def _miss(cell: Cell, settings: TrackingSettings, steps: list[float], share: float, seed: int) -> float:
+    """Median over eight headings of the miss after a series of moves (m); a series walks at random."""
+    misses = []
+    for i in range(8):
+        rng = np.random.default_rng([seed, i])
+        plan, targets = cell.plan, cell.targets
+        heading = 2 * np.pi * i / 8
+        for step in steps:
+            direction = np.array([np.cos(heading), np.sin(heading), 0.0])
+            T = targets.T_world_object
+            try:
+                targets = updated_targets(targets, pin.SE3(T.rotation, T.translation + step * direction), cell.task)
+            except OutOfReach:
+                break
+            candidate = track(
+                plan, targets, cell.task, plan.start_time + share * cell.plan.durations[APPROACH], settings
+            )
+            if candidate.plan is None:
+                break
+            plan = candidate.plan
+            heading += rng.uniform(-np.pi / 2, np.pi / 2)
+        else:
+            misses.append(end_point_error(plan.arm[APPROACH], cell.task.robot))
+    return float(np.median(misses)) if misses else float("nan")
+
+
+def _displaced(T: pin.SE3, rng: np.random.Generator, distance: float, degrees: float) -> pin.SE3:
+    heading, turn = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(-degrees, degrees))
+    offset = rng.uniform(0.0, distance) * np.array([np.cos(heading), np.sin(heading), 0.0])
+    return pin.SE3(pin.utils.rotate("z", turn) @ T.rotation, T.translation + offset)
