@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -120,7 +121,7 @@ class IpoptSolver:
             )
         return self._solvers[key][1]
 
-    def options(self) -> dict[str, object]:
+    def options(self) -> dict[str, Any]:
         """Options of CasADi's interface to IPOPT, but for the derivatives."""
         settings = self.settings
         return {

@@ -20,7 +20,7 @@ from numba import njit
 
 from dyngrasp.planning.collocation.closed_form import SHORTEST_DURATION
 from dyngrasp.planning.collocation.node_functions import NodeFunctions
-from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, Indices
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
 
@@ -49,8 +49,8 @@ class LimitRows:
     half_width: Array
     velocity: Array
     acceleration: Array
-    lower_index: Array
-    upper_index: Array
+    lower_index: Indices
+    upper_index: Indices
     lower: Array
     upper: Array
     inverse_scale: Array
@@ -290,4 +290,4 @@ def rows_transposed(y: Array, T: float, v: Array, jacobian: Array, limits: tuple
             by_T -= 2.0 / T * v[k, j] * by_u[n + j]
     if not fixed:
         by_T += (y[y.size - 2] - y[y.size - 1]) / longest
-    return by_T
+    return float(by_T)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, TAPS
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, TAPS, Indices
 from dyngrasp.signals import Array
 
 
@@ -52,7 +52,7 @@ def assemble(
     factor: float,
     curvature: float,
     shift: float,
-    first: Array,
+    first: Indices,
     taps: Array,
     slope: Array,
     band: Array,
@@ -191,4 +191,4 @@ def assemble(
             for j in range(n):
                 for d in range(blocks * n - j):
                     band[col + j, d] += run[j, j + d]
-    return corner
+    return float(corner)

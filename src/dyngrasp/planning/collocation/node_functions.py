@@ -13,6 +13,7 @@ from typing import Protocol
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from dyngrasp.planning.collocation import code_cache
 from dyngrasp.planning.collocation.node_code import HEADER, kernel
@@ -33,7 +34,7 @@ class NodeFunctions(Protocol):
 
     rows: int
     compiled: bool
-    depends_on_acceleration: Array
+    depends_on_acceleration: NDArray[np.bool_]
 
     def values(self, q: Array, v: Array, p: Array, g: Array, column: int) -> None:
         """Write g (K, total) in columns `column` to `column + m`.
@@ -85,7 +86,7 @@ def node_functions(constraint: NodeConstraint) -> NodeFunctions:
 _made: dict[tuple, tuple[ca.Function, NodeFunctions]] = {}
 
 
-def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, Array]:
+def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, NDArray[np.bool_]]:
     """(q, v, p) → g and (q, v, p, weights) → g, Jacobian, Hessian, and which rows depend on v.
 
     CasADi stores columns; a matrix that shall lie in rows is handed out transposed.
@@ -101,7 +102,7 @@ def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, Array
     values = ca.Function("values", [q, v, p], [g], options)
     derivatives = ca.Function("derivatives", [q, v, p, weights], [g, jacobian.T, hessian], options)
     by_acceleration = np.array(ca.DM(function.jac_sparsity(0, 1), 1.0)).reshape(m, n)
-    return values, derivatives, by_acceleration.any(axis=1)
+    return values, derivatives, np.any(by_acceleration != 0, axis=1)
 
 
 class InterpretedNodeFunctions:

@@ -25,11 +25,13 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
 
+Indices = NDArray[np.intp]
 TAPS = 3  # unknowns that a grid point depends on
 POSITION, RATE, CURVATURE = 0, 1, 2  # order of q, w, a wherever the three are an axis of an array
 
@@ -45,7 +47,7 @@ class ThreeTap:
         slope: (3, N+1, n) coefficient of T [q/w/a, k, joint]; zero but at the three grid points nearest to each end.
     """
 
-    first: Array
+    first: Indices
     taps: Array
     offset: Array
     slope: Array
@@ -77,7 +79,7 @@ class ThreeTap:
 
 
 @lru_cache(maxsize=64)
-def _filters(intervals: int) -> tuple[Array, Array, Array]:
+def _filters(intervals: int) -> tuple[Indices, Array, Array]:
     """`first`, `taps` and the coefficients (N+1, 3, 2, 2) of the four eliminated values [k, z, end, before/after]."""
     N, h = intervals, 1.0 / intervals
     weights = np.array([[0.25, -0.5 / h, 1 / h**2], [0.5, 0.0, -2 / h**2], [0.25, 0.5 / h, 1 / h**2]])
@@ -101,7 +103,7 @@ def _filters(intervals: int) -> tuple[Array, Array, Array]:
 
 
 @njit(cache=True)
-def expand(first: Array, taps: Array, offset: Array, slope: Array, x: Array, duration: float, z: Array) -> None:
+def expand(first: Indices, taps: Array, offset: Array, slope: Array, x: Array, duration: float, z: Array) -> None:
     """Write z = offset + T slope + taps applied to x."""
     kinds, points, n = z.shape
     for kind in range(kinds):
@@ -114,7 +116,7 @@ def expand(first: Array, taps: Array, offset: Array, slope: Array, x: Array, dur
 
 
 @njit(cache=True)
-def expand_step(first: Array, taps: Array, slope: Array, dx: Array, dT: float, dz: Array) -> None:
+def expand_step(first: Indices, taps: Array, slope: Array, dx: Array, dT: float, dz: Array) -> None:
     """The linear part of `expand`: how q, w and a change with dx and dT."""
     kinds, points, n = dz.shape
     for kind in range(kinds):
@@ -127,7 +129,7 @@ def expand_step(first: Array, taps: Array, slope: Array, dx: Array, dT: float, d
 
 
 @njit(cache=True)
-def pull_back(first: Array, taps: Array, slope: Array, dual: Array, gradient: Array) -> float:
+def pull_back(first: Indices, taps: Array, slope: Array, dual: Array, gradient: Array) -> float:
     """The transpose of `expand_step`: derivatives by q, w and a become derivatives by x.
 
     Args:
