@@ -38,10 +38,9 @@ def solver_of(name: str) -> Solve | None:
 
 def _split(program: SparseProgram) -> tuple[Any, Array, Any, Array, Array]:
     """Equalities and the box: for solvers that treat both apart."""
-    boxes = program.P.shape[0]
-    rows = program.E.shape[0] - boxes
+    rows = program.rows - program.variables
     lower, upper = program.lower[rows:], program.upper[rows:]
-    return program.E[:rows].tocsc(), program.lower[:rows], program.P.tocsc(), lower, upper
+    return sp.csc_matrix(program.E[:rows]), program.lower[:rows], sp.csc_matrix(program.P), lower, upper
 
 
 class _Piqp:
@@ -54,8 +53,8 @@ class _Piqp:
 
     def __call__(self, program: SparseProgram) -> tuple[Array, float]:
         A, b, P, lower, upper = _split(program)
-        c = np.zeros(P.shape[0])
-        none = sp.csc_matrix((0, P.shape[0]))
+        c = np.zeros(program.variables)
+        none = sp.csc_matrix((0, program.variables))
         if self._solver is None:
             self._solver = self._piqp.SparseSolver()
             settings = self._solver.settings
@@ -84,7 +83,7 @@ class _Osqp:
             self._solver = self._osqp.OSQP()
             self._solver.setup(
                 P=sp.triu(sp.csc_matrix(program.P), format="csc"),
-                q=np.zeros(E.shape[1]),
+                q=np.zeros(program.variables),
                 A=E,
                 l=program.lower,
                 u=program.upper,
@@ -119,7 +118,7 @@ class _Clarabel:
         settings.verbose = False
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
         began = time.perf_counter()
-        solver = clarabel.DefaultSolver(sp.csc_matrix(program.P), np.zeros(E.shape[1]), A, b, cones, settings)
+        solver = clarabel.DefaultSolver(sp.csc_matrix(program.P), np.zeros(program.variables), A, b, cones, settings)
         x = np.array(solver.solve().x)
         return x, 1e3 * (time.perf_counter() - began)
 

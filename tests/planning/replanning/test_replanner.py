@@ -90,7 +90,7 @@ def test_random_replans_with_every_fallback(complete, plan, targets, task):
     for _ in range(300):
         t = rng.uniform(plan.start_time, plan.phase_ends[1])
         size = 10 ** rng.uniform(-3.5, -0.7)
-        T = displaced(targets.T_world_object, *(size * rng.normal(size=2)), 5 * size * rng.normal())
+        T = displaced(targets.T_world_object, size * rng.normal(), size * rng.normal(), 5 * size * rng.normal())
         result = complete.replan_to_pose(plan, targets, estimate(T, t), t)
         paths.add(result.path)
         if result.ok:
@@ -253,12 +253,12 @@ def test_a_plan_of_another_maker_is_replanned_as_well(local, plan, targets, task
         ]
         wide = np.full(n, np.inf)
         problem = TrackingProblem(
-            reference, *ends, True, False, -wide, wide, wide, wide, trajectory.duration, trajectory.duration
+            reference, ends[0], ends[1], True, False, -wide, wide, wide, wide, trajectory.duration, trajectory.duration
         )
         return solve_tracking(problem).trajectory(problem)
 
-    arm = tuple(on_grid(phase, count) for phase, count in zip(plan.arm, (120, 90, 80), strict=True))
-    hand = tuple(on_grid(phase, count) for phase, count in zip(plan.gripper, (120, 90, 80), strict=True))
+    arm = on_grid(plan.arm[0], 120), on_grid(plan.arm[1], 90), on_grid(plan.arm[2], 80)
+    hand = on_grid(plan.gripper[0], 120), on_grid(plan.gripper[1], 90), on_grid(plan.gripper[2], 80)
     other = GraspPlan(arm, hand, plan.start_time, plan.arm_joints, plan.gripper_joints)
     T = displaced(targets.T_world_object, 0.004, 0.003, 0.02)
     result = local.replan_to_pose(other, targets, estimate(T, 0.3), 0.3)
@@ -299,6 +299,7 @@ def test_the_papers_mode_publishes_what_its_update_gives(task, plan, targets):
     T = displaced(targets.T_world_object, 0.03, 0.0, 0.0)
     result = paper.replan_to_pose(plan, targets, estimate(T, 0.3), 0.3)
     assert result.ok
+    assert result.audit is not None
     assert not result.audit.ok
     # products of deviations: ten times what the audit takes for rounding, at this size of move
     assert result.audit["dynamics"].worst > 1e-8

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngrasp.errors import OutOfReach
-from dyngrasp.models.inverse_kinematics import inverse_kinematics_for
+from dyngrasp.models.srs_kinematics import SrsKinematics
 from dyngrasp.planning.grasp_targets import moved
 from dyngrasp.planning.replanning.target_update import TargetUpdater, updated_targets
 
@@ -30,7 +30,7 @@ def test_hand_comes_to_the_new_pose_by_the_same_branch_and_arm_angle(task, targe
     new = updated_targets(targets, T, task)
     above = pin.SE3(np.eye(3), np.array([0.0, 0.0, task.settings.pregrasp_distance]))
     T_grasp = T * targets.grasp.T_object_grasp
-    kinematics = inverse_kinematics_for(task.robot)
+    kinematics = SrsKinematics.from_robot(task.robot)
     for old, state, wanted, posture in (
         (targets.grasped, new.grasped, T_grasp, targets.gripper_closed),
         (targets.pregrasp, new.pregrasp, T_grasp * above, targets.gripper_open),

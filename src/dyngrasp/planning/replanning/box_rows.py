@@ -15,6 +15,7 @@ from numba import njit
 
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
+    Indices,
     factorise,
     product,
     pull_back,
@@ -60,7 +61,14 @@ def bound(
 
 @njit(cache=True, error_model="numpy")
 def collect(
-    z: Array, T: float, T_lin: float, boxes: Array, rates: Array, margin: float, a_ends: tuple[bool, bool], codes: Array
+    z: Array,
+    T: float,
+    T_lin: float,
+    boxes: Array,
+    rates: Array,
+    margin: float,
+    a_ends: tuple[bool, bool],
+    codes: Indices,
 ) -> tuple[int, float]:
     """Write the codes of the rows closer to their bound than `margin`; return their number and the least row of all."""
     _, K, n = z.shape
@@ -88,8 +96,8 @@ def collect(
 
 @njit(cache=True, error_model="numpy")
 def interior_point(
-    codes: Array,
-    first: Array,
+    codes: Indices,
+    first: Indices,
     taps: Array,
     base: Array,
     weights: Array,
@@ -325,13 +333,13 @@ def _scatter(
     factor: float,
     rows: int,
     used: int,
-    kinds: Array,
-    nodes: Array,
-    joints: Array,
+    kinds: Indices,
+    nodes: Indices,
+    joints: Indices,
     signs: Array,
     scales: Array,
     cs: Array,
-    first: Array,
+    first: Indices,
     taps: Array,
     out: Array,
 ) -> float:

@@ -16,15 +16,18 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from dyngrasp.signals import Array
+
+Indices = NDArray[np.int64]
 
 POSITION, RATE, CURVATURE = 0, 1, 2
 TAPS = 3
 
 
 @lru_cache(maxsize=64)
-def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -> tuple[Array, Array, Array]:
+def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -> tuple[Indices, Array, Array]:
     """How grid points depend on the unknowns, and the bands of Σ_k zᵀz.
 
     Args:
@@ -55,7 +58,7 @@ def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -
         rows[:, 0] = 0.0
     if hold_end:
         rows[:, -1] = 0.0
-    first = np.clip(np.arange(N + 1) - 2, 0, size - TAPS)
+    first = np.clip(np.arange(N + 1, dtype=np.int64) - 2, 0, size - TAPS)
     taps = np.stack([rows[k, first[k] : first[k] + TAPS] for k in range(N + 1)])
     counted = slice(None) if ends_cost else slice(1, N)
     bands = np.zeros((3, size, TAPS))
@@ -123,7 +126,7 @@ def filtered(r: Array, z: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def pull_back(first: Array, taps: Array, dual: Array, gradient: Array) -> None:
+def pull_back(first: Indices, taps: Array, dual: Array, gradient: Array) -> None:
     """Overwrite `gradient` (N−1, n) by the derivatives by x of Σ dual · z, `dual` (3, N+1, n)."""
     _, K, n = dual.shape
     gradient[:] = 0.0
@@ -136,7 +139,7 @@ def pull_back(first: Array, taps: Array, dual: Array, gradient: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def push_forward(first: Array, taps: Array, dx: Array, z: Array) -> None:
+def push_forward(first: Indices, taps: Array, dx: Array, z: Array) -> None:
     """Add the change of q, w, a with dx (N−1, n) to z (3, N+1, n)."""
     _, K, n = z.shape
     for k in range(K):

@@ -65,10 +65,20 @@ class SparseProgram:
         lower, upper: Bounds of the rows of E.
     """
 
-    P: sp.csc_matrix
-    E: sp.csc_matrix
+    P: sp.csc_array
+    E: sp.csc_array
     lower: Array
     upper: Array
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of E."""
+        return self.lower.size
+
+    @property
+    def variables(self) -> int:
+        """Number of variables."""
+        return int(self.P.indptr.size) - 1
 
 
 def sparse_program(problem: TrackingProblem) -> SparseProgram:
@@ -108,10 +118,10 @@ def sparse_program(problem: TrackingProblem) -> SparseProgram:
     ):
         fixed = 3 * n if held else 2 * n
         lower[k, :fixed] = upper[k, :fixed] = state.ravel()[:fixed] - star[k, :fixed]
-    zeros = np.zeros(dynamics.shape[0])
+    zeros = np.zeros(N * (2 * n + 1))
     return SparseProgram(
-        sp.diags_array(cost.ravel()).tocsc(),
-        sp.vstack([dynamics.tocsc(), sp.eye_array((N + 1) * width)]).tocsc(),
+        sp.csc_array(sp.diags_array(cost.ravel())),
+        sp.csc_array(sp.vstack([sp.csc_array(dynamics), sp.eye_array((N + 1) * width)])),
         np.concatenate([zeros, lower.ravel()]),
         np.concatenate([zeros, upper.ravel()]),
     )

@@ -153,4 +153,6 @@ def target_updater(task: GraspTask) -> TargetUpdater:
 def _carried(twist: Array, T_world_object: pin.SE3, T_world_flange: pin.SE3) -> Array:
     """(6,) twist of the flange as it would be fixed to the part."""
     lever = T_world_flange.translation - T_world_object.translation
-    return np.concatenate([twist[:3] + np.cross(twist[3:], lever), twist[3:]])
+    carried = twist.copy()
+    carried[:3] += np.cross(twist[3:], lever)
+    return carried

@@ -8,6 +8,7 @@ from numba import njit
 from dyngrasp.planning.replanning.box_rows import INFEASIBLE, OPTIMAL, UNBOUNDED, collect, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
+    Indices,
     boundary,
     factorise,
     filtered,
@@ -28,7 +29,7 @@ NEAR = 0.15
 
 
 @njit(cache=True, error_model="numpy")
-def distinct(codes: Array) -> int:
+def distinct(codes: Indices) -> int:
     """Sort the codes, put each of them first once, and return how many there are."""
     codes.sort()
     count = 0
@@ -52,12 +53,12 @@ def solve(
     boxes: Array,
     paper_rows: bool,
     duration: tuple[float, float],
-    first: Array,
+    first: Indices,
     taps: Array,
     bands: Array,
     max_iterations: int,
     z: Array,
-    codes: Array,
+    codes: Indices,
     multipliers: Array,
 ) -> tuple[int, float, int, int]:
     """Minimise ½ Σ_k Σ_j Q_q δq² + Q_q̇ δq̇² + Q_v δv² + ½ Σ_k Q_ΔT δT² between two boundary states, within boxes.

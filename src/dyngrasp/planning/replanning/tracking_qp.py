@@ -21,7 +21,7 @@ from dyngrasp.errors import InvalidProblem
 from dyngrasp.planning.problem import MIN_INTERVALS, Status
 from dyngrasp.planning.replanning import tracking_kernel
 from dyngrasp.planning.replanning.box_rows import INFEASIBLE, ITERATION_LIMIT, NONFINITE, OPTIMAL, UNBOUNDED
-from dyngrasp.planning.replanning.joint_splines import filters
+from dyngrasp.planning.replanning.joint_splines import Indices, filters
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
 
@@ -114,7 +114,7 @@ class TrackingSolution:
     duration: float
     scaled: Array
     iterations: int
-    rows: Array
+    rows: Indices
     multipliers: Array
     elapsed_ms: float
 
