@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from dyngrasp.errors import ModelFileError, UnknownName
+from dyngrasp.models.camera import CameraModel, read_camera
 from dyngrasp.models.gripper import GripperModel, read_gripper
 from dyngrasp.models.model_file import read_toml
 from dyngrasp.models.robot import RobotModel, read_robot
@@ -25,6 +26,7 @@ ASSETS = Path(__file__).parent / "assets"
 ROBOTS: Mapping[str, Path] = MappingProxyType({"iiwa14": ASSETS / "robots" / "iiwa14"})
 GRIPPERS: Mapping[str, Path] = MappingProxyType({"sdh2": ASSETS / "grippers" / "sdh2"})
 OBJECTS: Mapping[str, Path] = MappingProxyType({"casting": ASSETS / "objects" / "casting"})
+CAMERAS: Mapping[str, Path] = MappingProxyType({"ava1000": ASSETS / "cameras" / "ava1000"})
 
 
 def load_robot(name_or_path: str | Path) -> RobotModel:
@@ -52,6 +54,11 @@ def load_object(name_or_path: str | Path) -> GraspObject:
     return read_object(_model_file("object", name_or_path, OBJECTS))
 
 
+def load_camera(name_or_path: str | Path) -> CameraModel:
+    """A camera of the catalogue, or of a user's model.toml; arguments and errors as for `load_robot`."""
+    return read_camera(_model_file("camera", name_or_path, CAMERAS))
+
+
 def _model_file(kind: str, name_or_path: str | Path, known: Mapping[str, Path]) -> Path:
     if str(name_or_path) in known:
         return known[str(name_or_path)] / "model.toml"
@@ -69,7 +76,7 @@ class CatalogueRow:
     """One model of the catalogue, for lists.
 
     Attributes:
-        kind: "robot", "gripper" or "object".
+        kind: "robot", "gripper", "object" or "camera".
         name: The name to load it by.
         description: One line about it.
         path: Its model.toml.
@@ -82,9 +89,9 @@ class CatalogueRow:
 
 
 def catalogue() -> tuple[CatalogueRow, ...]:
-    """All models of the package, robots first, then grippers, then objects."""
+    """All models of the package, robots first, then grippers, objects and cameras."""
     rows = []
-    for kind, known in (("robot", ROBOTS), ("gripper", GRIPPERS), ("object", OBJECTS)):
+    for kind, known in (("robot", ROBOTS), ("gripper", GRIPPERS), ("object", OBJECTS), ("camera", CAMERAS)):
         for name, folder in known.items():
             path = folder / "model.toml"
             rows.append(CatalogueRow(kind, name, str(read_toml(path).get("description", "")), path))
@@ -107,7 +114,7 @@ def check_model(path: str | Path) -> list[str]:
     if path.is_dir():
         path = path / "model.toml"
     kind = read_toml(path).get("kind")
-    describe = {"robot": _robot_facts, "gripper": _gripper_facts, "object": _object_facts}
+    describe = {"robot": _robot_facts, "gripper": _gripper_facts, "object": _object_facts, "camera": _camera_facts}
     if kind not in describe:
         raise ModelFileError(path, "kind", kind, "one of " + ", ".join(f'"{name}"' for name in describe))
     return describe[kind](path)
@@ -179,4 +186,18 @@ def _object_facts(path: Path) -> list[str]:
         f"object {part.name}: {part.spatial_inertia.mass:.3f} kg",
         f"its origin rests {part.rest_height * 1e3:.1f} mm above the ground",
         *(f"grasp {grasp.name}: {grasp.width * 1e3:.1f} mm wide" for grasp in part.grasps),
+    ]
+
+
+def _camera_facts(path: Path) -> list[str]:
+    camera = read_camera(path)
+    left_right, top_bottom = (
+        np.rad2deg(2.0 * np.arctan(0.5 * size / focal))
+        for size, focal in zip((camera.width, camera.height), camera.focal, strict=True)
+    )
+    x, y, z = 1e3 * camera.T_hand_camera.translation
+    return [
+        f"camera {camera.name}: {camera.description}" if camera.description else f"camera {camera.name}",
+        f"{camera.width} x {camera.height} pixels at {camera.rate:g} Hz, exposure {camera.exposure * 1e3:g} ms",
+        f"sees {left_right:.1f} x {top_bottom:.1f} deg, from ({x:.0f}, {y:.0f}, {z:.0f}) mm in the hand frame",
     ]
