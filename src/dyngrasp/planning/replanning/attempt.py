@@ -1,0 +1,302 @@
+"""One call of the replanner: the ways to a new plan in their order, the audit after each, the clock before the next."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from dyngrasp.errors import GraspRefused, OutOfReach
+from dyngrasp.planning.audit import audit
+from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
+from dyngrasp.planning.problem import AuditReport, PhaseProblem, Status
+from dyngrasp.planning.replanning.full_problem import FullProblem, raised
+from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, funnel_recovery
+from dyngrasp.planning.replanning.outcome import Path, ReplannerSettings, ReplanResult
+from dyngrasp.planning.replanning.splice import APPROACH, DELIVER, GRASP, Candidate, splice_time, track
+from dyngrasp.planning.replanning.target_update import target_updater
+from dyngrasp.signals import PoseEstimate
+from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, PlanSample
+
+
+class Attempt:
+    """One call: what is known, and the clock that runs."""
+
+    def __init__(
+        self,
+        task: GraspTask,
+        settings: ReplannerSettings,
+        full: FullProblem | None,
+        clock: Callable[[], float],
+        plan: GraspPlan,
+        t: float,
+    ) -> None:
+        self.task, self.settings, self.full = task, settings, full
+        self.plan, self.t = plan, t
+        self.clock = clock
+        self.began, self.began_wall = self.clock(), time.perf_counter()
+        self.timings: dict[str, float] = {}
+        self.report: AuditReport | None = None
+        self.recovery: FunnelRecovery | None = None
+        self.reasons: list[str] = []
+        self.iterations = 0
+        self.previous: GraspTargets | None = None
+        self.splice = splice_time(plan, t + self.settings.budget)
+
+    def to_pose(self, previous: GraspTargets, estimate: PoseEstimate) -> ReplanResult:
+        """See `Replanner.replan_to_pose`."""
+        refusal = self._refusal()
+        if refusal:
+            return self._kept(Status.INFEASIBLE, previous, refusal)
+        self.previous = previous
+        updater, twist = target_updater(self.task), estimate.twist_world
+        plan, targets = self.plan, previous
+        # A slower part than this moves less than `settled` while the grasp time changes by a second.
+        moving = bool(np.abs(twist).max() > self.settings.settled)
+        grasp_time = float(plan.phase_ends[GRASP])
+        for _ in range(8 if moving else 1):
+            started = time.perf_counter()
+            T = estimate.T_world_object
+            if moving:
+                T = moved(T, twist, grasp_time - estimate.t_capture)
+            try:
+                targets = updater.update(
+                    previous, T, twist if moving else None, grasp_time, float(plan.durations[GRASP])
+                )
+            except OutOfReach as error:
+                self._count("targets", started)
+                return self._fresh_or_kept(previous, estimate, f"inverse kinematics: {error}")
+            self._count("targets", started)
+            if not moving:
+                break
+            candidate = self._track(targets)
+            if candidate.plan is None:
+                break
+            change = float(candidate.plan.phase_ends[GRASP]) - grasp_time
+            grasp_time, plan = grasp_time + change, candidate.plan
+            if abs(change) * float(np.abs(twist).max()) <= self.settings.settled:
+                break
+        return self.towards(targets, estimate, previous)
+
+    def towards(
+        self, targets: GraspTargets, estimate: PoseEstimate | None = None, previous: GraspTargets | None = None
+    ) -> ReplanResult:
+        """See `Replanner.replan`."""
+        self.previous = previous
+        refusal = self._refusal()
+        if refusal:
+            return self._kept(Status.INFEASIBLE, targets, refusal)
+        phase = self.plan.phase_at(self.splice)
+        if phase == APPROACH:
+            share = self.settings.recovery_share
+            self.recovery = funnel_recovery(self.plan, targets, self.task, self.splice, share)
+            if self.recovery is None:
+                return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
+        status, candidate, best = Status.INFEASIBLE, None, None
+        # In the grasp, and where the paper's program has no way of its own, one way is all there is.
+        ways = len(self.settings.tracking.descents) if phase == APPROACH and self.settings.gate else 1
+        for way in range(ways):
+            candidate = self._track(targets, way)
+            self.iterations += candidate.iterations
+            status = candidate.status
+            if candidate.plan is None:
+                self.reasons.append(f"tracking: {candidate.message}")
+                break
+            best = candidate.plan
+            self.report = self._audited(best, targets)
+            if self.report.ok or not self.settings.gate:
+                return self._published(best, targets, Path.TRACKING, self.settings.budget)
+            status = Status.AUDIT_FAILED
+            self.reasons.append(f"tracking: {_failures(self.report)}")
+            if self._late(self.settings.budget):
+                return self._kept(Status.DEADLINE_MISSED, targets, "no time for another attempt")
+            if not _about_the_approach(self.report, best):
+                break
+        if best is not None and self.full is not None and phase == APPROACH:
+            found = self._reoptimised(best, targets)
+            if found is not None:
+                return self._published(found, targets, Path.REOPTIMISED, self.settings.budget)
+        return self._fresh_or_kept(targets, estimate, "", status)
+
+    def _refusal(self) -> str:
+        """Why nothing may change any more; "" if it may."""
+        plan, task = self.plan, self.task
+        if self.splice < plan.start_time:
+            return "the running plan has not taken over yet"
+        phase = plan.phase_at(self.splice)
+        if phase == DELIVER:
+            return "the part is in the hand"
+        left = float(plan.phase_ends[phase]) - self.splice
+        if left < self.settings.least_horizon:
+            return f"{left:.3f} s are left of the phase {PHASE_NAMES[phase]}"
+        if phase == GRASP:
+            closed = plan.gripper[GRASP].position[-1]
+            gap = task.gripper.aperture(plan.sample(self.splice).gripper.position) - task.gripper.aperture(closed)
+            if gap < 2 * self.settings.finger_clearance:
+                return "the fingers close on the part"
+        return ""
+
+    def _track(self, targets: GraspTargets, way: int = 0) -> Candidate:
+        started = time.perf_counter()
+        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking, way, self.previous)
+        self._count("tracking", started)
+        return candidate
+
+    def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
+        started = time.perf_counter()
+        report = audit(plan, targets, self.task, self.splice)
+        if self.recovery is not None and plan.start_time == self.splice:
+            report = self.recovery.judge(report, plan, targets, self.task)
+        self._count("audit", started)
+        return report
+
+    def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> GraspPlan | None:
+        """Solve the phases that the audit refuses under all constraints; None if that does not help."""
+        assert self.full is not None
+        assert self.report is not None
+        assert self.recovery is not None
+        state = self.plan.sample(self.splice)
+        started = time.perf_counter()
+        left = float(self.plan.phase_ends[APPROACH]) - self.splice
+        problems, why = self.full.problems(state, left, targets, self.recovery)
+        self._count("full", started)
+        if problems is None:
+            self.reasons.append(f"full problem: {why}")
+            return None
+        return self._refined(candidate, set(), problems, state, targets, self.settings.budget)
+
+    def _refined(
+        self,
+        plan: GraspPlan,
+        solved: set[int],
+        problems: tuple[PhaseProblem, ...],
+        state: PlanSample,
+        targets: GraspTargets,
+        budget: float,
+    ) -> GraspPlan | None:
+        """Solve what the audit refuses, and audit again, until it refuses nothing or nothing is left to be done.
+
+        Between its grid points a motion may pass the funnel's wall; then the wall is moved by as much as that was.
+        """
+        assert self.full is not None
+        assert self.report is not None
+        why = ""
+        for _ in range(self.settings.rounds):
+            refused = {plan.phase_at(min(entry.time, plan.end_time)) for entry in self.report.failures}
+            if self._late(budget):
+                why = "no time left"
+                break
+            through_wall = [entry for entry in self.report.failures if entry.name == "funnel"]
+            if APPROACH in solved and through_wall:
+                problems = (raised(problems[APPROACH], -1.2 * through_wall[0].worst), *problems[1:])
+            elif refused <= solved:
+                break
+            started = time.perf_counter()
+            improved, why = self.full.improve(plan, refused, problems, state, targets, lambda: self._late(budget))
+            self._count("full", started)
+            if improved is None:
+                break
+            plan, solved = improved, solved | refused
+            self.report = self._audited(plan, targets)
+            if self.report.ok:
+                return plan
+        self.reasons.append(f"full problem: {why or _failures(self.report)}")
+        return None
+
+    def _fresh_or_kept(
+        self, targets: GraspTargets, estimate: PoseEstimate | None, reason: str, status: Status = Status.INFEASIBLE
+    ) -> ReplanResult:
+        """Plan anew from where the arm will be after the longer budget; the old plan bridges that time."""
+        if reason:
+            self.reasons.append(reason)
+        budget, plan = self.settings.fresh_budget, self.plan
+        splice = self.t + budget
+        left = float(plan.phase_ends[APPROACH]) - splice
+        if self.full is None or left < self.settings.least_horizon or self._late(budget):
+            return self._kept(status, targets, "")
+        state = plan.sample(splice)
+        waits = np.abs(state.gripper.position - targets.gripper_open).max() <= JOIN_TOLERANCE
+        if not waits or state.gripper.velocity.any():
+            return self._kept(status, targets, "fresh plan: the hand is not open and at rest")
+        started = time.perf_counter()
+        try:
+            if not targets.moving:
+                T = targets.T_world_object if estimate is None else estimate.T_world_object
+                targets = grasp_targets(T, self.task, state.arm.position)
+        except (OutOfReach, GraspRefused) as error:
+            self._count("fresh", started)
+            return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
+        recovery = funnel_recovery(plan, targets, self.task, splice, self.settings.recovery_share)
+        fresh, problems, why = None, None, "the hand is beside the part, below the new grasp frame"
+        if recovery is not None:
+            problems, why = self.full.problems(state, left, targets, recovery)
+            if problems is not None:
+                fresh, why = self.full.fresh(plan, splice, problems, state, targets)
+        self._count("fresh", started)
+        if fresh is None:
+            return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {why}")
+        self.splice, self.recovery = splice, recovery
+        self.report = self._audited(fresh, targets)
+        if not self.report.ok:
+            assert problems is not None
+            self.reasons.append(f"fresh plan: {_failures(self.report)}")
+            fresh = self._refined(fresh, {APPROACH, GRASP, DELIVER}, problems, state, targets, budget)
+        if fresh is None:
+            return self._kept(Status.AUDIT_FAILED, targets, "")
+        return self._published(fresh, targets, Path.FRESH, budget)
+
+    def _late(self, budget: float) -> bool:
+        return self.clock() - self.began > budget
+
+    def _count(self, stage: str, started: float) -> None:
+        self.timings[stage] = self.timings.get(stage, 0.0) + 1e3 * (time.perf_counter() - started)
+
+    def _published(self, plan: GraspPlan, targets: GraspTargets, path: Path, budget: float) -> ReplanResult:
+        """The last look at the clock comes after everything else: what is late is not published."""
+        factor = self.recovery.factor if self.recovery is not None else 1.0
+        self.timings["total"] = 1e3 * (time.perf_counter() - self.began_wall)
+        elapsed = self.clock() - self.began
+        if elapsed > budget:
+            return self._kept(Status.DEADLINE_MISSED, targets, f"{1e3 * elapsed:.1f} ms of {1e3 * budget:.0f} ms taken")
+        message = "; ".join(self.reasons)
+        return ReplanResult(
+            Status.CONVERGED,
+            plan,
+            path,
+            self.splice,
+            targets,
+            self.report,
+            factor,
+            self.timings,
+            message,
+            self.iterations,
+        )
+
+    def _kept(self, status: Status, targets: GraspTargets, reason: str) -> ReplanResult:
+        if reason:
+            self.reasons.append(reason)
+        self.timings["total"] = 1e3 * (time.perf_counter() - self.began_wall)
+        factor = self.recovery.factor if self.recovery is not None else 1.0
+        message = "; ".join(self.reasons)
+        return ReplanResult(
+            status,
+            self.plan,
+            Path.KEPT,
+            self.splice,
+            targets,
+            self.report,
+            factor,
+            self.timings,
+            message,
+            self.iterations,
+        )
+
+
+def _about_the_approach(report: AuditReport, plan: GraspPlan) -> bool:
+    """Whether all that fails happens before the pre-grasp, where another descent may help."""
+    return all(entry.time <= plan.phase_ends[APPROACH] for entry in report.failures)
+
+
+def _failures(report: AuditReport) -> str:
+    return "audit: " + "; ".join(str(entry) for entry in report.failures)
