@@ -11,7 +11,6 @@ import pinocchio as pin
 
 from dyngrasp.errors import OutOfReach
 from dyngrasp.experiments.bench_plan import PLACE_DEG, START_DEG
-from dyngrasp.experiments.qp_solvers import solver_of
 from dyngrasp.experiments.statistics import timing_summary
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.audit import audit
@@ -19,6 +18,7 @@ from dyngrasp.planning.collocation.planner import CollocationPlanner, Collocatio
 from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
 from dyngrasp.planning.problem import Status
+from dyngrasp.planning.replanning.general_solvers import solver_of
 from dyngrasp.planning.replanning.lcqp import end_point_error, sparse_program
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
 from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, rest_of, track

@@ -3,7 +3,7 @@
 The quadratic program knows nothing of the funnel. But the old motion came down inside the old funnel, and carried
 along rigidly with the part it comes down inside the new one. So below the height z_th, where the funnel's wall
 begins, the reference of the program is the carried motion and its positions have weight; above, the correction is
-free to spread. Eq. (13) has weights Q_k that may differ from grid point to grid point.
+free to spread. Eq. (14) has weights Q_k that may differ from grid point to grid point.
 
 The carried motion is solved for at a few grid points by inverse kinematics of the same branch and arm angle; between
 them its difference to the old motion is a polynomial.

@@ -102,7 +102,7 @@ def funnel_recovery(
 
 
 def _height_and_wall(q: Array, q_h: Array, t: float, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
-    """Z of G in the grasp frame and the height of the wall there, eq. (6) (m)."""
+    """Height of G in the grasp frame and that of the wall below or above it, eq. (5) (m)."""
     gripper, funnel = task.gripper, task.grasp_object.funnel
     T_hand = task.robot.forward_kinematics(q) * gripper.T_flange_hand
     G = T_hand.act(gripper.grasp_point(q_h))

@@ -1,4 +1,4 @@
-"""The paper's linearly constrained quadratic program (14) and its update (15), to the letter, for comparison.
+"""The paper's linearly constrained quadratic program (13) and its update (15), to the letter, for comparison.
 
 With x = (q, q̇), f = (q̇, v) the matrices of eq. (12) are
 
@@ -82,7 +82,7 @@ class SparseProgram:
 
 
 def sparse_program(problem: TrackingProblem) -> SparseProgram:
-    """Eq. (14) of a problem as general solvers take it.
+    """Eq. (13) of a problem as general solvers take it.
 
     Args:
         problem: With `paper_rows`: boxes, sums and fixed boundary accelerations are then those of the paper.

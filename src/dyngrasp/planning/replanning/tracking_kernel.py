@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.box_rows import INFEASIBLE, OPTIMAL, UNBOUNDED, collect, interior_point
+from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
+from dyngrasp.planning.replanning.interior_point import INFEASIBLE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
     Indices,
@@ -73,7 +74,7 @@ def solve(
         duration_weight: Q_ΔT of one grid point.
         ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
         boxes: (4, n) q_min, q_max, q̇_max, v_max.
-        paper_rows: The boxes of eq. (14c), which are linear about the reference, instead of the exact ones.
+        paper_rows: The boxes of eq. (13c), which are linear about the reference, instead of the exact ones.
         duration: Bounds of T (s); equal ones fix it.
         first: Of `filters`.
         taps: Of `filters`.

@@ -1,4 +1,4 @@
-"""The online quadratic program (14) in the variables of scaled time, where its step is exact.
+"""The online quadratic program (13) in the variables of scaled time, where its step is exact.
 
 The paper's step (δq, δq̇, δv, δT) and the step (δq, δw, δa, δT) of w = T q̇, a = T² v are related by
 
@@ -20,7 +20,8 @@ import numpy as np
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.planning.problem import MIN_INTERVALS, Status
 from dyngrasp.planning.replanning import tracking_kernel
-from dyngrasp.planning.replanning.box_rows import INFEASIBLE, ITERATION_LIMIT, NONFINITE, OPTIMAL, UNBOUNDED
+from dyngrasp.planning.replanning.box_rows import UNBOUNDED
+from dyngrasp.planning.replanning.interior_point import INFEASIBLE, ITERATION_LIMIT, NONFINITE, OPTIMAL
 from dyngrasp.planning.replanning.joint_splines import Indices, filters
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
@@ -65,7 +66,7 @@ class TrackingProblem:
         velocity_limit, acceleration_limit: (n,) limits, +inf where there is none.
         min_duration, max_duration: Bounds of ΔT (s), 0 < min ≤ max < ∞; equal ones fix it.
         weights: Of the deviations.
-        paper_rows: Boxes linear in (δq̇, δv) as in eq. (14c), and sums over k = 1 … N−1; the motion then is that of
+        paper_rows: Boxes linear in (δq̇, δv) as in eq. (13c), and sums over k = 1 … N−1; the motion then is that of
             the paper's update (15), with its defect.
         node_weights: (N+1,) added to Q_q at each grid point, where the motion has to stay with the reference; none if
             left out.
