@@ -3,7 +3,7 @@
 Free mode: Mehrotra's predictor–corrector chooses the barrier parameter anew in every iteration, and full steps to the
 boundary are taken as long as the error estimate E falls within a few iterations. Monotone mode: the barrier parameter
 is fixed until its problem is solved, and Armijo's rule on the barrier merit function accepts steps. Where a free step
-raises E it is taken back and the monotone mode goes on, until E has fallen by half (Nocedal, Wächter, Waltz 2009,
+raises E it is taken back and the monotone mode goes on, until E is a tenth (Nocedal, Wächter, Waltz 2009,
 "Adaptive barrier update strategies for nonlinear interior methods"). In monotone mode every step is a descent step of a
 smooth function bounded below, hence the iterates approach its stationary points (Gould, Orban, Toint 2015, for elastic
 rows). Where such a point violates a row, the violation alone is minimised; if it cannot be brought to zero the problem
@@ -134,7 +134,7 @@ class InteriorPoint:
             if feasible and error <= settings.tolerance * self.unit:
                 return Outcome.OPTIMAL, self.best, iteration
             if iteration == settings.max_iterations:
-                return Outcome.ITERATION_LIMIT, self.best, iteration
+                break
             if time.perf_counter() > deadline:
                 return Outcome.DEADLINE, self.best, iteration
             if not feasible and self._violation_stays(violation, error, iteration):
@@ -160,7 +160,7 @@ class InteriorPoint:
                 if model.factor == 0.0:
                     return Outcome.INFEASIBLE, self.best, iteration
                 self._restart(0.0, iteration)
-        raise AssertionError("the loop returns in its last round")
+        return Outcome.ITERATION_LIMIT, self.best, settings.max_iterations
 
     def _restart(self, factor: float, iteration: int) -> None:
         """Slacks and multipliers for the present point, in free mode; `factor` weighs the objective."""
