@@ -87,7 +87,9 @@ def test_pinocchio_and_mujoco_read_the_same_model(name: str) -> None:
         pin.framesForwardKinematics(robot, scratch, q)
         for i in range(model.nsite):
             frame = scratch.oMf[robot.getFrameId(model.site(i).name)]
-            np.testing.assert_allclose(frame.homogeneous, site_pose(model, data, model.site(i).name).homogeneous, atol=EXACT)
+            np.testing.assert_allclose(
+                frame.homogeneous, site_pose(model, data, model.site(i).name).homogeneous, atol=EXACT
+            )
 
 
 @pytest.mark.parametrize(("name", "mass"), [("iiwa14", 29.9), ("sdh2", 1.95)])
@@ -184,7 +186,12 @@ def test_only_the_pads_reach_a_flat_rib() -> None:
     height = site_pose(spec.compile(), data, "pad_1").translation[2]
     # 30 mm of rib above the contact: the height at which ribs are pinched, with as much below it as the tips reach.
     spec.worldbody.add_geom(
-        name="rib", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.017, 0.03], pos=[0.0, 0.0, height], contype=1, conaffinity=1
+        name="rib",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[0.1, 0.017, 0.03],
+        pos=[0.0, 0.0, height],
+        contype=1,
+        conaffinity=1,
     )
     model = spec.compile()
     data = hand_data(model, posture)
@@ -221,9 +228,7 @@ def test_collision_geoms_of_a_distal_link_lie_within_the_tactile_arc(link: str) 
         for i in range(with_probe.ngeom):
             geom = with_probe.geom(i)
             if with_probe.geom_bodyid[i] == body and geom.contype[0]:
-                distance = mujoco.mj_geomDistance(
-                    with_probe, scratch, i, with_probe.geom("probe").id, 1.0, np.zeros(6)
-                )
+                distance = mujoco.mj_geomDistance(with_probe, scratch, i, with_probe.geom("probe").id, 1.0, np.zeros(6))
                 assert distance > -2e-5, (geom.name, degrees, distance)
 
 
