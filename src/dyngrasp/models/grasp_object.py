@@ -55,6 +55,9 @@ class MarkerTable(StrictSchema):
     quat_wxyz: UnitQuaternion
 
 
+MarkerDictionary = Literal["4x4_50", "5x5_50", "6x6_50", "apriltag_36h11"]
+
+
 class InertiaTable(StrictSchema):
     """`[inertia]` about the centre of mass in object axes (kg m²)."""
 
@@ -81,6 +84,7 @@ class ObjectFile(StrictSchema):
     grasps: tuple[GraspTable, ...]
     funnel: FunnelTable
     friction: FrictionTable
+    marker_dictionary: MarkerDictionary = "4x4_50"
     markers: tuple[MarkerTable, ...] = ()
 
 
@@ -141,6 +145,7 @@ class GraspObject:
         funnel: Where the grasp point may pass on the approach.
         friction: Pad on part, as the planner assumes it.
         markers: Fiducials on its faces.
+        marker_dictionary: Which family of patterns they belong to.
     """
 
     name: str
@@ -155,6 +160,7 @@ class GraspObject:
     funnel: Funnel
     friction: Friction
     markers: tuple[Marker, ...]
+    marker_dictionary: MarkerDictionary = "4x4_50"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre_of_mass", read_only(self.centre_of_mass, (3,)))
@@ -200,6 +206,9 @@ def read_object(path: str | Path) -> GraspObject:
     names = [grasp.name for grasp in table.grasps]
     if len(set(names)) != len(names):
         raise ModelFileError(path, "grasps", names, "names that differ from one another")
+    ids = [marker.id for marker in table.markers]
+    if len(set(ids)) != len(ids):
+        raise ModelFileError(path, "markers", ids, "ids that differ from one another")
     inertia = _inertia(table.inertia, path)
     mesh = _load_mesh(path, "mesh", table.mesh)
     if not mesh.is_watertight:
@@ -223,6 +232,7 @@ def read_object(path: str | Path) -> GraspObject:
         funnel=Funnel(table.funnel.z_threshold, table.funnel.sigma_x, table.funnel.sigma_y),
         friction=Friction(table.friction.sliding, table.friction.torsional),
         markers=tuple(Marker(m.id, m.size, _pose(m.position, m.quat_wxyz)) for m in table.markers),
+        marker_dictionary=table.marker_dictionary,
     )
 
 
