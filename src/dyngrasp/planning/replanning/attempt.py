@@ -43,6 +43,7 @@ class Attempt:
         self.iterations = 0
         self.previous: GraspTargets | None = None
         self.splice = splice_time(plan, t + self.settings.budget)
+        self.state = plan.sample(self.splice)
 
     def to_pose(self, previous: GraspTargets, estimate: PoseEstimate) -> ReplanResult:
         """See `Replanner.replan_to_pose`."""
@@ -90,7 +91,7 @@ class Attempt:
         phase = self.plan.phase_at(self.splice)
         if phase == APPROACH:
             share = self.settings.recovery_share
-            self.recovery = funnel_recovery(self.plan, targets, self.task, self.splice, share)
+            self.recovery = funnel_recovery(self.state, targets, self.task, self.splice, share)
             if self.recovery is None:
                 return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
         status, candidate, best = Status.INFEASIBLE, None, None
@@ -132,14 +133,16 @@ class Attempt:
             return f"{left:.3f} s are left of the phase {PHASE_NAMES[phase]}"
         if phase == GRASP:
             closed = plan.gripper[GRASP].position[-1]
-            gap = task.gripper.aperture(plan.sample(self.splice).gripper.position) - task.gripper.aperture(closed)
+            gap = task.gripper.aperture(self.state.gripper.position) - task.gripper.aperture(closed)
             if gap < 2 * self.settings.finger_clearance:
                 return "the fingers close on the part"
         return ""
 
     def _track(self, targets: GraspTargets, way: int = 0) -> Candidate:
         started = time.perf_counter()
-        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking, way, self.previous)
+        candidate = track(
+            self.plan, targets, self.task, self.splice, self.settings.tracking, way, self.previous, self.state
+        )
         self._count("tracking", started)
         return candidate
 
@@ -156,7 +159,7 @@ class Attempt:
         assert self.full is not None
         assert self.report is not None
         assert self.recovery is not None
-        state = self.plan.sample(self.splice)
+        state = self.state
         started = time.perf_counter()
         left = float(self.plan.phase_ends[APPROACH]) - self.splice
         problems, why = self.full.problems(state, left, targets, self.recovery)
@@ -227,7 +230,7 @@ class Attempt:
         except (OutOfReach, GraspRefused) as error:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
-        recovery = funnel_recovery(plan, targets, self.task, splice, self.settings.recovery_share)
+        recovery = funnel_recovery(state, targets, self.task, splice, self.settings.recovery_share)
         fresh, problems, why = None, None, "the hand is beside the part, below the new grasp frame"
         if recovery is not None:
             problems, why = self.full.problems(state, left, targets, recovery)

@@ -18,7 +18,7 @@ import numpy as np
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditReport, NodeConstraint
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import GraspPlan
+from dyngrasp.trajectory import GraspPlan, PlanSample
 
 # Of the constraint's parameters: three of G, twelve of the grasp frame, then z_th.
 _HEIGHT_PARAMETER = 15
@@ -80,18 +80,17 @@ class FunnelRecovery:
 
 
 def funnel_recovery(
-    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, share: float
+    state: PlanSample, targets: GraspTargets, task: GraspTask, splice: float, share: float
 ) -> FunnelRecovery | None:
     """The softening that a replan needs; None if the hand is below the grasp frame and no softening helps.
 
     Args:
-        plan: The running plan.
+        state: Of the running plan at the splice.
         targets: The new targets.
         task: Arm, gripper, part.
         splice: When the new trajectory takes over (s).
         share: σ.
     """
-    state = plan.sample(splice)
     height, wall = _height_and_wall(state.arm.position, state.gripper.position, splice, targets, task)
     if height - wall >= _MARGIN:
         return FunnelRecovery(1.0, share)

@@ -22,7 +22,7 @@ from dyngrasp.planning.problem import MIN_INTERVALS, Status
 from dyngrasp.planning.replanning.carried_descent import DescentSettings, carried_descent
 from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingSolution, TrackingWeights, solve_tracking
 from dyngrasp.signals import Array, JointState
-from dyngrasp.trajectory import GraspPlan, Trajectory
+from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory
 
 APPROACH, GRASP, DELIVER = range(3)
 
@@ -97,6 +97,7 @@ def track(
     settings: TrackingSettings,
     way: int = 0,
     previous: GraspTargets | None = None,
+    state: PlanSample | None = None,
 ) -> Candidate:
     """Continue a plan from the splice on to new targets.
 
@@ -108,13 +109,15 @@ def track(
         settings: How.
         way: Which of the descents.
         previous: What the plan was made for; only a moving part makes a difference.
+        state: Of the plan at the splice, if it is known already.
     """
     begun = plan.phase_at(splice)
+    state = state or plan.sample(splice)
     solutions: list[TrackingSolution] = []
     arm, hand = list(plan.arm), list(plan.gripper)
     for phase in range(begun, 3):
         if phase == APPROACH:
-            solution, arm[phase], hand[phase] = _approach(plan, targets, task, splice, settings, way, previous)
+            solution, arm[phase], hand[phase] = _approach(plan, state, targets, task, splice, settings, way, previous)
         elif phase == begun:
             solution, arm[phase] = _rest_of_grasp(plan, targets, task, splice, settings)
         else:
@@ -174,6 +177,7 @@ def hand_needs(trajectory: Trajectory, task: GraspTask) -> float:
 
 def _approach(
     plan: GraspPlan,
+    state: PlanSample,
     targets: GraspTargets,
     task: GraspTask,
     splice: float,
@@ -183,29 +187,28 @@ def _approach(
 ) -> tuple[TrackingSolution, Trajectory, Trajectory]:
     local = splice - (plan.phase_ends[APPROACH] - plan.durations[APPROACH])
     N, n = plan.arm[APPROACH].intervals, task.robot.n
-    reference, hand = rest_of(plan.arm[APPROACH], local, N), rest_of(plan.gripper[APPROACH], local, N)
+    reference, hand = rest_of(plan.arm[APPROACH], local, N), plan.gripper[APPROACH]
     still = not (hand.velocity.any() or hand.acceleration.any())
+    if not still:
+        hand = rest_of(hand, local, N)
+        still = not (hand.velocity.any() or hand.acceleration.any())
     weights = None
     if not settings.paper_rows:
         carried = carried_descent(reference, splice, targets, previous, task, settings.descents[way])
         if carried is not None:
             reference, weights = carried
-    problem = _splice_program(reference, plan, targets.pregrasp, splice, task, settings)
+    problem = _splice_program(reference, state.arm, targets.pregrasp, task, settings)
     if weights is not None:
         problem = replace(problem, node_weights=weights * settings.weights.acceleration)
     if not still:
-        problem = _with_hand(problem, hand, plan, targets, splice, task)
+        problem = _with_hand(problem, hand, state.gripper, targets, task)
     solution = solve_tracking(problem)
     if solution.status is not Status.CONVERGED:
         return solution, plan.arm[APPROACH], plan.gripper[APPROACH]
     both = solution.trajectory(problem)
     if still:
-        # What remains of rounding in a sampled hand at rest must not show as a motion.
-        zero = np.zeros_like(hand.position)
-        held = np.broadcast_to(targets.gripper_open, hand.position.shape)
-        start = plan.sample(splice).gripper.position
-        rest = hand.position if np.abs(start - targets.gripper_open).max() > 0 else held
-        return solution, both, Trajectory(both.duration, rest, zero, zero)
+        zero = np.zeros((N + 1, hand.position.shape[1]))
+        return solution, both, Trajectory(both.duration, zero + hand.position[-1], zero, zero)
     columns = (slice(0, n), slice(n, None))
     arm, fingers = (
         Trajectory(both.duration, both.position[:, c], both.velocity[:, c], both.acceleration[:, c]) for c in columns
@@ -214,15 +217,9 @@ def _approach(
 
 
 def _splice_program(
-    reference: Trajectory,
-    plan: GraspPlan,
-    end: BoundaryState,
-    splice: float,
-    task: GraspTask,
-    settings: TrackingSettings,
+    reference: Trajectory, state: JointState, end: BoundaryState, task: GraspTask, settings: TrackingSettings
 ) -> TrackingProblem:
-    """The program of the arm from its state in the plan at the splice."""
-    state = plan.sample(splice).arm
+    """The program of the arm from its state at the splice."""
     return _program(
         reference,
         np.stack([state.position, state.velocity, state.acceleration]),
@@ -235,10 +232,10 @@ def _splice_program(
 
 
 def _with_hand(
-    arm: TrackingProblem, hand: Trajectory, plan: GraspPlan, targets: GraspTargets, splice: float, task: GraspTask
+    arm: TrackingProblem, hand: Trajectory, state: JointState, targets: GraspTargets, task: GraspTask
 ) -> TrackingProblem:
     """The same program with the moving joints of the hand beside those of the arm."""
-    gripper, state = task.gripper, plan.sample(splice).gripper
+    gripper = task.gripper
     zero = np.zeros_like(targets.gripper_open)
     start = np.stack([state.position, state.velocity, state.acceleration])
     end = np.stack([targets.gripper_open, zero, zero])
