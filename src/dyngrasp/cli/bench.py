@@ -19,7 +19,7 @@ def bench(options: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON. A benchmark is done and good whatever it found."""
     if options.benchmark == "replan":
         return _replan(options)
-    console = Console()
+    console = _console()
     if options.json:
         check_writable(options.json)
     against = tuple(name.strip() for name in options.against.split(",") if name.strip())
@@ -42,8 +42,14 @@ def bench(options: argparse.Namespace) -> int:
     return DELIVERED
 
 
-def _replan(options: argparse.Namespace) -> int:
+def _console() -> Console:
+    """The terminal as it is; in a file or a pipe lines are long enough for the widest table."""
     console = Console()
+    return console if console.is_terminal else Console(width=140)
+
+
+def _replan(options: argparse.Namespace) -> int:
+    console = _console()
     if options.json:
         check_writable(options.json)
     against = tuple(name.strip() for name in options.against.split(",") if name.strip())
