@@ -173,7 +173,8 @@ def solve(
                     complement -= column[i, j] * solved[i, j]
                     dT += solved[i, j] * gradient[i, j]
             dT /= complement
-            dT = min(max(dT, -0.5 * T), T)
+            # For given T the rest follows: at a bound of T the program is solved by clipping, for it is convex.
+            dT = min(max(dT, duration[0] - T), duration[1] - T)
         substitute(band, gradient)
         if free_T:
             for i in range(size):
@@ -202,18 +203,14 @@ def solve(
     a_ends = (not held[0], not held[1])
     count, least = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
     iterations, outcome = 0, OPTIMAL
-    duration_ok = not free_T or (duration[0] <= T <= duration[1])
-    if least < -VIOLATION or not duration_ok:
+    if least < -VIOLATION:
         weigh(error, scaled, node_weights, k_first, k_last, dual)
         cost = 0.5 * (stiffness_T * (T - T_ref) ** 2 + product(dual, error))
         # The cost of moving by what is violated is the scale of a program whose free optimum costs next to nothing.
-        outside = max(-least, 0.0)
-        if free_T:
-            outside = max(outside, (duration[0] - T) / duration[1], (T - duration[1]) / duration[1])
-        unit = max(cost, 0.5 * (stiffness_T + np.sum(scaled[0])) * outside * outside, 1e-9)
+        unit = max(cost, 0.5 * (stiffness_T + np.sum(scaled[0])) * least * least, 1e-9)
         x_free, z_free, error_free = x.copy(), z.copy(), error.copy()
         T_free, gradient_free = T, gradient_T
-        margin = NEAR + max(-least, 0.0)
+        margin = NEAR - least
         count, _ = collect(z, T, T_lin, boxes, rates, margin, a_ends, codes)
         for attempt in range(3):
             x[:], z[:], error[:], T = x_free, z_free, error_free, T_free
