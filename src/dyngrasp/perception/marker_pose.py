@@ -136,7 +136,7 @@ class MarkerPoseSolver:
                     candidates.append(candidate)
         candidates.sort(key=lambda candidate: (-len(candidate.markers), candidate.error))
         rivals = [c for c in candidates if len(c.markers) == len(candidates[0].markers)]
-        # Eight residuals with six parameters are expected at half the noise of a corner; below that, ratios say nothing.
+        # Eight residuals of six parameters are expected at half the noise of a corner; below, a ratio says nothing.
         floor = 0.5 * self.settings.corner_noise
         ratio = max(rivals[1].error, floor) / max(rivals[0].error, floor) if len(rivals) > 1 else np.inf
         return Sighting(tuple(candidates), seen, float(ratio), bool(ratio < self.settings.clear_ratio))
