@@ -25,7 +25,7 @@ from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, rest
 from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingWeights, paper_step, solve_tracking
 from dyngrasp.signals import PoseEstimate
-from dyngrasp.trajectory import GraspPlan
+from dyngrasp.trajectory import GraspPlan, Trajectory
 
 RATE = 10.0  # replans a second in the sequences (Hz)
 
@@ -106,7 +106,7 @@ def qp_problems(cell: Cell, case: str, count: int, seed: int) -> Iterator[Tracki
             targets = updated_targets(cell.targets, _displaced(cell.targets.T_world_object, rng, 0.03, 8.0), task)
         except OutOfReach:
             continue
-        reference = rest_of(plan.arm[APPROACH], t - plan.start_time, plan.arm[APPROACH].intervals)
+        reference = _consistent(rest_of(plan.arm[APPROACH], t - plan.start_time, plan.arm[APPROACH].intervals))
         state, end = plan.sample(t).arm, targets.pregrasp
         speed = limits.velocity
         if case == "qp_active":
@@ -129,6 +129,16 @@ def qp_problems(cell: Cell, case: str, count: int, seed: int) -> Iterator[Tracki
             _WEIGHTS,
             paper_rows=True,
         )
+
+
+def _consistent(motion: Trajectory) -> Trajectory:
+    """The nearest motion that obeys the trapezoidal rule, as eq. (9) supposes of a reference; samples nearly do."""
+    start, end = (np.stack([motion.position[k], motion.velocity[k], motion.acceleration[k]]) for k in (0, -1))
+    wide = np.full(motion.position.shape[1], np.inf)
+    problem = TrackingProblem(
+        motion, start, end, True, True, -wide, wide, wide, wide, motion.duration, motion.duration, _WEIGHTS
+    )
+    return solve_tracking(problem).trajectory(problem)
 
 
 def _structured_row(case: str, problems: list[TrackingProblem]) -> dict[str, Any]:
