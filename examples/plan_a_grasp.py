@@ -20,7 +20,7 @@ result = dg.CollocationPlanner(task).plan(q_start, targets)
 plan = result.require()
 
 print(f"grasp {targets.grasp.name!r}; phases {plan.durations.round(2).tolist()} s")
-for entry in result.audit.entries:
+for entry in result.audit.entries if result.audit else ():
     print(f"  {entry}")
 
 state = plan.sample(plan.phase_ends[0])

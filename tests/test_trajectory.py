@@ -117,14 +117,14 @@ def test_a_plan_is_held_at_rest_after_its_end():
 def test_joins_that_do_not_meet_are_refused():
     p = plan()
     moved = Trajectory(0.3, p.arm[1].position + 1e-6, p.arm[1].velocity, p.arm[1].acceleration)
-    with pytest.raises(InvalidTrajectory, match="position jumps by 1.00e-06 between approach and grasp"):
+    with pytest.raises(InvalidTrajectory, match=r"position jumps by 1\.00e-06 between approach and grasp"):
         GraspPlan((p.arm[0], moved, p.arm[2]), p.gripper, 0.0, p.arm_joints, p.gripper_joints)
 
 
 def test_arm_and_gripper_share_their_durations():
     p = plan()
     slow = chain(3, (0.7, 0.4, 1.1), 5)
-    with pytest.raises(InvalidTrajectory, match="phase grasp: arm takes 0.3 s, gripper 0.4 s"):
+    with pytest.raises(InvalidTrajectory, match=r"phase grasp: arm takes 0\.3 s, gripper 0\.4 s"):
         GraspPlan(p.arm, slow, 0.0, p.arm_joints, p.gripper_joints)
 
 

@@ -37,8 +37,8 @@ class PlannedGrasp:
     ) -> EpisodeRecord:
         """Carry the plan out on a plant drawn from `seed`, the part off its expected pose by `error` (object frame)."""
         task = self.task
-        spread = {} if friction is None else {"friction_range": (friction, friction)}
-        variation = PlantVariation.draw(np.random.default_rng(seed), task.robot.n, **spread)
+        friction_range = (0.6, 0.9) if friction is None else (friction, friction)
+        variation = PlantVariation.draw(np.random.default_rng(seed), task.robot.n, friction_range=friction_range)
         plant = MujocoPlant(
             build_scene(task.robot, task.gripper, task.grasp_object, variation),
             self.plan.arm[0].position[0],

@@ -86,6 +86,7 @@ def test_every_answer_is_used_only_when_it_is_there(replanned):
 def test_answers_after_their_splice_are_late_and_change_nothing(planned, replanner):
     _, loop, outcome = episode(planned, OFF, replanner, settings=ReplanningSettings(latency=0.03))
     assert loop is not None
+    assert loop is not None
     usable = [event for event in loop.events if event.result.path is not Path.KEPT]
     assert usable
     assert all(event.late for event in usable if event.result.path is not Path.FRESH)
@@ -99,6 +100,7 @@ def test_what_a_nearing_camera_reveals_is_enough(planned, replanner):
     believed = (OFF * T_object_grasp).actInv(T_object_grasp)
     source = NoisyPoses(PoseNoise(believed, T_object_grasp, PoseNoiseSettings(reveal_from=0.2, reveal_to=0.08), 4))
     record, loop, outcome = episode(planned, OFF, replanner, source)
+    assert loop is not None
     assert outcome.success, outcome.cause
     assert len(record) > 0
     assert loop is not None

@@ -42,8 +42,8 @@ def plan(task):
 
     spans = list(itertools.pairwise(ends))
     return GraspPlan(
-        tuple(phase(*s) for s in spans),
-        tuple(hand(*s) for s in spans),
+        (phase(*spans[0]), phase(*spans[1]), phase(*spans[2])),
+        (hand(*spans[0]), hand(*spans[1]), hand(*spans[2])),
         0.0,
         task.robot.joint_names,
         task.gripper.joint_names,

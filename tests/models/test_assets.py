@@ -137,7 +137,8 @@ def test_start_of_the_paper_lies_over_the_ground_within_the_limits() -> None:
     model = mujoco.MjModel.from_xml_path(str(MJCF["iiwa14"]))
     data = mujoco.MjData(model)
     q = np.deg2rad(Q_START_DEG)
-    assert np.all(q > model.jnt_range[:, 0]) and np.all(q < model.jnt_range[:, 1])
+    assert np.all(q > model.jnt_range[:, 0])
+    assert np.all(q < model.jnt_range[:, 1])
     data.qpos[:] = q
     mujoco.mj_forward(model, data)
     pose = site_pose(model, data, "flange")
@@ -216,7 +217,7 @@ def test_collision_geoms_of_a_distal_link_lie_within_the_tactile_arc(link: str) 
     mujoco.mj_forward(model, data)
     centre = np.array([-0.012, 0.0, 0.0435])
     body = model.body(link).id
-    # MuJoCo's distance to a ball that just touches the arc from the outside, at angles from the pad's normal to the tip.
+    # MuJoCo's distance to a ball that just touches the arc from the outside, from the pad's normal to the tip.
     for degrees in range(-30, 91, 10):
         direction = np.array([np.cos(np.deg2rad(degrees)), 0.0, np.sin(np.deg2rad(degrees))])
         probe = data.xpos[body] + data.xmat[body].reshape(3, 3) @ (centre + (0.025 + 0.004) * direction)
@@ -259,7 +260,7 @@ def test_stowed_thumb_stays_behind_the_fingers() -> None:
 
 @pytest.mark.parametrize("posture", ["open", "closed"])
 def test_hand_is_free_of_itself_and_of_the_wrist(posture: str) -> None:
-    """Over the whole range of A6 and A7 no geom of the hand meets links 0 to 5 or a part of the hand it is not joined to."""
+    """Over the whole range of A6 and A7 no geom of the hand meets links 0 to 5 or a finger it is not joined to."""
     model = arm_with_hand()
     toml = read_toml(HAND)
     data = mujoco.MjData(model)

@@ -80,7 +80,8 @@ def settings_schema(settings: type, *, leave_out: tuple[str, ...] = ()) -> type[
     fields: dict[str, Any] = {}
     for item in dataclasses.fields(settings):
         # numpy scalars appear as defaults that were computed, such as deg2rad(1)
-        default = item.default.item() if hasattr(item.default, "item") else item.default
+        default: Any = item.default
+        default = default.item() if hasattr(default, "item") else default
         if item.name not in leave_out and type(default) in kinds:
             fields[item.name] = (kinds[type(default)], default)
     return create_model(f"{settings.__name__}Section", __base__=StrictSchema, **fields)

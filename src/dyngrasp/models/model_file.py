@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 UNIT_QUATERNION_TOLERANCE = 1e-6
-"""Largest accepted deviation of a quaternion's norm from one: a file with six digits passes, an unscaled one does not."""
+"""Largest deviation of a quaternion's norm from one: a file with six digits passes, an unscaled one does not."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -142,11 +142,13 @@ def _keys_in_file(location: tuple[int | str, ...], data: dict[str, Any], *, miss
     """Drop the parts of a pydantic location that name union members instead of keys of the file."""
     found: list[int | str] = []
     here: Any = data
+    part: Any
     for position, part in enumerate(location):
-        if isinstance(here, dict) and part in here or isinstance(here, list) and isinstance(part, int):
+        if (isinstance(here, dict) and part in here) or (isinstance(here, list) and isinstance(part, int)):
             found.append(part)
-            here = here[part] if isinstance(here, dict) or part < len(here) else None
-        elif missing and position == len(location) - 1 or isinstance(part, int):
+            inside = isinstance(here, dict) or (isinstance(part, int) and part < len(here))
+            here = here[part] if inside else None
+        elif (missing and position == len(location) - 1) or isinstance(part, int):
             found.append(part)
     return tuple(found)
 

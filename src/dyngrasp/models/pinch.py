@@ -37,8 +37,8 @@ def pad_loads(force: Any, moment: Any, pinch: Pinch) -> list[tuple[Any, Any]]:
         pinch: The grip.
 
     Returns:
-        For the pad at y = w/2, then for the one at −w/2: the squared load over (μ N)², and the normal force over N. The pad holds while the first is
-        at most the square of the second.
+        For the pad at y = w/2, then for the one at −w/2: the squared load over (μ N)², and the normal force over N. The
+        pad holds while the first is at most the square of the second.
     """
     fx, fy, fz = force[0], force[1], force[2]
     mx, my, mz = moment[0], moment[1], moment[2]

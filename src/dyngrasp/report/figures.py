@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -26,7 +27,7 @@ PHASE_GREY = "#e4e4e6"
 INK = "#26262b"
 FAINT = "#9a9aa2"
 
-STYLE = {
+STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.labelsize": 8.5,
@@ -204,7 +205,7 @@ def _colours(count: int) -> list[Any]:
 
 
 def _darker(colour: Any) -> tuple[float, ...]:
-    return tuple(0.55 * c for c in mpl.colors.to_rgb(colour))
+    return tuple(0.55 * c for c in to_rgb(colour))
 
 
 def _draw(ax: Axes, planned: MotionCurves, measured: MotionCurves | None, scaled: Any, colours: list[Any]) -> None:

@@ -39,9 +39,9 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], frames_pe
         writer = imageio_ffmpeg.write_frames(
             str(temporary),
             (width, height),
-            fps=frames_per_second,
+            fps=frames_per_second,  # pyright: ignore[reportArgumentType] ffmpeg takes any rate
             codec="libx264",
-            quality=None,
+            quality=None,  # pyright: ignore[reportArgumentType] None leaves it to -crf
             # The frame size is taken as it is: padding to multiples of 16 would draw a border.
             macro_block_size=2,
             # faststart: the index comes first, so that a browser plays while it still loads.

@@ -75,5 +75,5 @@ def test_the_complement_tells_definiteness():
     assert banded.cholesky(band)
     for corner in (0.9 * enough, 1.1 * enough):
         full = np.block([[dense, column[:, None]], [column[None, :], np.array([[corner]])]])
-        complement = banded.schur_complement(band, column, corner, np.empty(30))
+        complement = banded.schur_complement(band, column, float(corner), np.empty(30))
         assert (complement > 0) == (np.linalg.eigvalsh(full)[0] > 0)

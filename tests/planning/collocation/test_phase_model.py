@@ -29,7 +29,7 @@ def position_row(n: int, N: int) -> NodeConstraint:
     """A row without accelerations, bounded above: constant at both ends."""
     q, v, p = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("p", 1)
     row = ca.Function("row", [q, v, p], [ca.sin(p * q[0]) * ca.sumsqr(q)])
-    return NodeConstraint("bent", row, np.full((N + 1, 1), 1.3), [-np.inf], [9.0], [2.0])
+    return NodeConstraint("bent", row, np.full((N + 1, 1), 1.3), *(np.array([x]) for x in (-np.inf, 9.0, 2.0)))
 
 
 @pytest.fixture(params=[4, 7])

@@ -99,7 +99,8 @@ def stationarity(problem: PhaseProblem, motion: Trajectory) -> float:
     """
     N, n, h = problem.intervals, problem.joints, 1 / problem.intervals
     A, T = ca.SX.sym("a", N + 1, n), ca.SX.sym("T")
-    w, q = [T * ca.DM(problem.start_velocity).T], [ca.DM(problem.start_position).T]
+    w: list[ca.SX] = [T * ca.DM(problem.start_velocity).T]
+    q: list[ca.SX] = [ca.SX(ca.DM(problem.start_position).T)]
     for k in range(N):
         w.append(w[k] + h / 2 * (A[k, :] + A[k + 1, :]))
         q.append(q[k] + h / 2 * (w[k] + w[k + 1]))
@@ -108,7 +109,7 @@ def stationarity(problem: PhaseProblem, motion: Trajectory) -> float:
         if 0 < k < N:
             rows += [q[k].T - problem.position_lower, problem.position_upper - q[k].T]
             rows += [T + w[k].T / problem.velocity_limit, T - w[k].T / problem.velocity_limit]
-        for i in np.flatnonzero(np.isfinite(problem.acceleration_limit)):
+        for i in np.flatnonzero(np.isfinite(problem.acceleration_limit)).tolist():
             rows += [T**2 + A[k, i] / problem.acceleration_limit[i], T**2 - A[k, i] / problem.acceleration_limit[i]]
         for c in problem.constraints:
             value = c.function(q[k].T, A[k, :].T / T**2, c.parameters[k])
