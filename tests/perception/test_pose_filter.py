@@ -158,11 +158,9 @@ def test_a_true_jump_is_followed_within_five_frames(settings, jump):
             verdicts.append(pose_filter.update(measure(random, there, k * FRAME)))
             if k >= 29:
                 e = error(pose_filter.estimate(k * FRAME), there)
-                # Measurements of 0.6 mm and 0.3° an axis, and a velocity that may have to be found again. One centimetre
-                # and 2.9° are about what a moving part may do: taken for speed, they can overshoot at first.
-                overshoot = jump == 0.01 and settings is MOVING
-                assert np.linalg.norm(e[:3]) < (jump if overshoot else 4e-3)
-                assert np.linalg.norm(e[3:]) < (5 * jump if overshoot else np.deg2rad(2))
+                # Measurements of 0.6 mm and 0.3° an axis, and a velocity that has to be found again.
+                assert np.linalg.norm(e[:3]) < 5e-3
+                assert np.linalg.norm(e[3:]) < np.deg2rad(2)
         assert Verdict.ACQUIRED in verdicts[25:30] or (jump == 0.01 and settings is MOVING)
 
 

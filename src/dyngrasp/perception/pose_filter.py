@@ -122,6 +122,14 @@ class _Track:
         place = bisect_right(self._steps, t, key=lambda step: step.state.t)
         return predict(self._steps[max(place - 1, 0)].state, t, self._settings.motion)
 
+    def surprise(self, candidates: Candidates) -> float:
+        """Twice the negative log likelihood of the candidate that fits best, less a constant; infinite off the gate."""
+        predicted = self.at(candidates[0].t_capture)
+        best, distance = nearest(predicted, candidates)
+        if not distance <= self._limit:
+            return np.inf
+        return distance + float(np.linalg.slogdet(predicted.covariance[:6, :6] + best.covariance)[1])
+
     def take(self, candidates: Candidates) -> bool:
         """Take in the candidate that fits best if it passes the gate."""
         t = candidates[0].t_capture
@@ -245,18 +253,21 @@ class PoseFilter:
         if t < newest - s.history or (self._track is not None and t < self._track.oldest):
             return Verdict.OLD
         self._captures = sorted([other for other in self._captures if other >= max(newest, t) - s.history] + [t])
-        if self._track is not None and t - self._track.newest <= s.longest_gap and self._track.take(candidates):
-            self._challengers.clear()
-            return Verdict.ACCEPTED
-        return self._challenge(candidates)
+        # Both poses of a square may begin a row of their own; the frames that follow tell them apart.
+        recent = [track for track in self._challengers if track.oldest <= t <= track.newest + s.longest_gap]
+        if self._track is not None and t - self._track.newest <= s.longest_gap:
+            # After refusals the gate of the track has opened wide. What a row of refused frames explains better must
+            # not slip through it and be taken for a sudden speed.
+            rival = min((track.surprise(candidates) for track in recent if track.frames > 1), default=np.inf)
+            surprise = self._track.surprise(candidates)
+            if surprise <= rival and self._track.take(candidates):
+                self._challengers.clear()
+                return Verdict.ACCEPTED
+        return self._challenge(candidates, recent)
 
-    def _challenge(self, candidates: Candidates) -> Verdict:
+    def _challenge(self, candidates: Candidates, recent: list[_Track]) -> Verdict:
         """Frames that the track refuses may agree with one another."""
-        t = candidates[0].t_capture
-        gap = self.settings.longest_gap
-        recent = [track for track in self._challengers if track.oldest <= t <= track.newest + gap]
         agreeing = [track for track in recent if track.take(candidates)]
-        # Both poses of a square begin a row of their own; the frames that follow tell them apart.
         self._challengers = agreeing or [_Track(c, self.settings, self._limit) for c in candidates]
         ripe = [track for track in self._challengers if track.frames >= self.settings.acquire_frames]
         if not ripe:
