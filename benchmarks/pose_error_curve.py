@@ -18,7 +18,7 @@ from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.report.figures import ErrorCurve, error_curve_figure, save_figure
 
 SCENARIO = Path(__file__).resolve().parents[1] / "scenarios" / "static_sdh2.toml"
-SIZES_MM = (0.0, 2.0, 5.0, 10.0, 20.0, 30.0)
+SIZES_MM = (2.0, 5.0, 10.0, 20.0, 30.0)
 DIRECTIONS = {"along the rib": "along_mm", "across the rib": "across_mm"}
 
 
