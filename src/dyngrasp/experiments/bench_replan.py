@@ -32,7 +32,7 @@ RATE = 10.0  # replans a second in the sequences (Hz)
 # Of the program alone: like the paper's, with weight on everything.
 _WEIGHTS = TrackingWeights(0.1, 0.1, 1.0, 100.0)
 
-# With the speed limits at this share of what the motion asks, some twenty rows of the program are active.
+# With the speed limits at this share of what the motion asks, some sixty rows of the program are active.
 _ACTIVE_SHARE = 0.985
 
 SEQUENCES = ("still", "drift", "step_3cm", "step_5cm", "moving")
