@@ -51,7 +51,9 @@ def run_table(summary: dict[str, Any]) -> Table:
     if worst:
         table.add_row("Worst ratio to limit", "", "")
         for key, label in _WORST:
-            ratio = worst.get(key)
+            if key not in worst:
+                continue
+            ratio = worst[key]
             table.add_row(f"  {label}", "no limit stated" if ratio is None else f"{ratio:.3f}", "")
     if summary["tracking"]:
         tracking = summary["tracking"]
