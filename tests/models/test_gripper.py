@@ -39,7 +39,8 @@ def test_grasp_point_is_the_midpoint_of_the_pad_sites(gripper, hand, postures):
         # Rounding of lengths of 0.3 m, through quaternions in MuJoCo.
         np.testing.assert_allclose(gripper.pad_centres(q_h), centres, rtol=0, atol=1e-14)
         np.testing.assert_allclose(gripper.grasp_point(q_h), centres.mean(axis=0), rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(gripper.grasp_point_many(postures), [gripper.grasp_point(q) for q in postures])
+    expected = [gripper.grasp_point(q) for q in postures]
+    np.testing.assert_allclose(gripper.grasp_point_many(postures), expected, rtol=0, atol=1e-15)
 
 
 def test_inertia_is_that_of_all_bodies(gripper, hand, postures):

@@ -14,6 +14,7 @@ from pydantic import Field
 from scipy.optimize import brentq
 
 from dyngrasp.errors import GraspRefused, ModelFileError
+from dyngrasp.models.batch_dynamics import Attachments, BatchModel
 from dyngrasp.models.kinematic_tree import frame_id, frames_named, read_tree, require_in_range, require_length
 from dyngrasp.models.model_file import Finite, Positive, StrictSchema, UnitQuaternion, Vector3, decode, read_toml
 from dyngrasp.signals import Array, read_only
@@ -165,7 +166,17 @@ class GripperModel:
 
     def grasp_point_many(self, q_h: Array) -> Array:
         """(K, 3) grasp points of the K postures q_h (K, m)."""
-        return np.array([self.grasp_point(posture) for posture in np.atleast_2d(q_h)]).reshape(-1, 3)
+        q_h = np.atleast_2d(q_h)
+        q = np.tile(self.full_configuration(self.open_posture), (len(q_h), 1))
+        q[:, self.planned_indices] = q_h
+        return self._batch[0].poses(q, self._batch[1])[1].mean(axis=1)
+
+    @cached_property
+    def _batch(self) -> tuple[BatchModel, Attachments]:
+        """Kinematics for many postures at once, and the arc centres in it."""
+        tree = BatchModel.from_pinocchio(self.pin_model)
+        pads = (self.pin_model.frames[i] for i in self.pad_ids)
+        return tree, tree.attach([(int(pad.parentJoint), pin.SE3(pad.placement)) for pad in pads])
 
     def grasp_point_jacobian(self, q_h: Array) -> Array:
         """(3, m) derivative of p_G with respect to q_h (m/rad)."""

@@ -93,7 +93,7 @@ def test_a_motion_that_stays_where_it_is_takes_no_time(make_problem):
 def test_way_points_are_met_at_least_effort(make_problem):
     problem = make_problem(5, intervals=40, effort_weight=0.1)
     nodes, waypoints = [11, 25], np.random.default_rng(0).uniform(-1, 1, (2, 7))
-    motion, cost = optimum_through(problem, nodes, waypoints)
+    motion, cost = optimum_through(problem, [nodes], waypoints)
     np.testing.assert_allclose(motion.position[nodes], waypoints, rtol=0, atol=ROUNDING)
     assert motion.dynamics_defect() < ROUNDING
     assert cost == pytest.approx(objective(problem, motion), rel=1e-12)
@@ -102,6 +102,16 @@ def test_way_points_are_met_at_least_effort(make_problem):
     for duration in (0.98 * motion.duration, 1.02 * motion.duration):
         slower = dense_least_effort(problem, duration, list(zip(nodes, waypoints, strict=True)))
         assert duration * (1 + 0.1 / 40 * np.sum(slower**2)) > cost
+
+
+def test_cheapest_of_several_timetables_is_taken(make_problem):
+    problem = make_problem(6, intervals=40, effort_weight=0.1)
+    timetables, waypoints = [[5, 9], [12, 27], [20, 36]], np.random.default_rng(1).uniform(-1, 1, (2, 7))
+    alone = [optimum_through(problem, [nodes], waypoints) for nodes in timetables]
+    best = min(range(3), key=lambda i: alone[i][1])
+    motion, cost = optimum_through(problem, timetables, waypoints)
+    assert cost == pytest.approx(alone[best][1], rel=1e-12)
+    np.testing.assert_allclose(motion.position, alone[best][0].position, rtol=0, atol=ROUNDING)
 
 
 def test_correction_is_the_smallest_that_meets_the_ends(make_problem):

@@ -90,22 +90,23 @@ def least_effort(problem: PhaseProblem, duration: float) -> Trajectory:
     return nearest_trajectory(problem, np.zeros((problem.intervals + 1, problem.joints)), duration)
 
 
-def effort_coefficients(problem: PhaseProblem) -> tuple[float, float, float]:
-    """c0, c1, c2 of the least Σ|a_k|² = c0 + c1 T + c2 T² over all motions of duration T."""
-    _, _, gram_inverse = _end_map(problem.intervals)
+def effort_coefficients(problem: PhaseProblem) -> Array:
+    """(3,) c0, c1, c2 of the least Σ|a_k|² = c0 + c1 T + c2 T² over all motions of duration T."""
     fixed = _end_change(problem, 0.0)
-    linear = _end_change(problem, 1.0) - fixed
-    return (
-        float(np.sum(fixed * (gram_inverse @ fixed))),
-        2.0 * float(np.sum(fixed * (gram_inverse @ linear))),
-        float(np.sum(linear * (gram_inverse @ linear))),
-    )
+    return _coefficients(_end_map(problem.intervals)[2], fixed, _end_change(problem, 1.0) - fixed)
+
+
+def _coefficients(gram_inverse: Array, fixed: Array, linear: Array) -> Array:
+    """(..., 3) of the least Σ|a_k|² that changes what the rows of a map say by fixed + T linear, each (..., rows, n)."""
+    by_fixed, by_linear = gram_inverse @ fixed, gram_inverse @ linear
+    products = (fixed * by_fixed, 2.0 * linear * by_fixed, linear * by_linear)
+    return np.stack([product.sum(axis=(-2, -1)) for product in products], axis=-1)
 
 
 def least_cost(problem: PhaseProblem, duration: float) -> float:
     """J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), the objective of `least_effort` (s)."""
-    c0, c1, c2 = effort_coefficients(problem)
-    return duration + problem.effort_weight / problem.intervals * (c0 / duration**3 + c1 / duration**2 + c2 / duration)
+    weight = problem.effort_weight / problem.intervals
+    return float(_cost(effort_coefficients(problem), weight, np.array([duration]))[0])
 
 
 def best_duration(problem: PhaseProblem) -> float:
@@ -113,20 +114,29 @@ def best_duration(problem: PhaseProblem) -> float:
 
     An end of the interval or a root of the quartic T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
     """
-    return _best_root(effort_coefficients(problem), problem)[0]
+    return float(_best_root(effort_coefficients(problem), problem)[0])
 
 
-def _best_root(coefficients: tuple[float, float, float], problem: PhaseProblem) -> tuple[float, float]:
-    """Duration within its bounds that minimises J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), and J there."""
-    c0, c1, c2 = coefficients
+def _cost(coefficients: Array, weight: float, duration: Array) -> Array:
+    """(..., D) J at durations (..., D) for coefficients (..., 3)."""
+    c0, c1, c2 = np.moveaxis(coefficients[..., None, :], -1, 0)
+    return duration + weight * (c0 / duration**3 + c1 / duration**2 + c2 / duration)
+
+
+def _best_root(coefficients: Array, problem: PhaseProblem) -> tuple[Array, Array]:
+    """Duration within its bounds that minimises J(T), and J there, for each row of coefficients (..., 3)."""
     weight = problem.effort_weight / problem.intervals
-    roots = np.roots([1.0, 0.0, -weight * c2, -2 * weight * c1, -3 * weight * c0])
+    companion = np.zeros((*coefficients.shape[:-1], 4, 4))
+    companion[..., 1:, :-1] = np.eye(3)
+    companion[..., 0, 1:] = weight * coefficients[..., ::-1] * (1.0, 2.0, 3.0)
+    roots = np.linalg.eigvals(companion).real
     shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
+    ends = np.broadcast_to([shortest, problem.max_duration], (*roots.shape[:-1], 2))
     # Complex pairs come with their real parts too: J decides, so a candidate too many does no harm.
-    candidates = np.clip(np.append(roots.real, [shortest, problem.max_duration]), shortest, problem.max_duration)
-    costs = candidates + weight * (c0 / candidates**3 + c1 / candidates**2 + c2 / candidates)
-    best = int(costs.argmin())
-    return float(candidates[best]), float(costs[best])
+    candidates = np.clip(np.concatenate([roots, ends], axis=-1), shortest, problem.max_duration)
+    costs = _cost(coefficients, weight, candidates)
+    best = costs.argmin(axis=-1, keepdims=True)
+    return np.take_along_axis(candidates, best, -1)[..., 0], np.take_along_axis(costs, best, -1)[..., 0]
 
 
 def unconstrained_optimum(problem: PhaseProblem) -> Trajectory:
@@ -134,30 +144,40 @@ def unconstrained_optimum(problem: PhaseProblem) -> Trajectory:
     return least_effort(problem, best_duration(problem))
 
 
-def optimum_through(problem: PhaseProblem, nodes: Sequence[int], waypoints: Array) -> tuple[Trajectory, float]:
-    """The cheapest motion that passes given positions at given grid points, without the inequalities.
+def optimum_through(
+    problem: PhaseProblem, timetables: Sequence[Sequence[int]], waypoints: Array
+) -> tuple[Trajectory, float]:
+    """The cheapest motion that passes given positions in turn, without the inequalities.
 
     Args:
         problem: Gives the boundary states, ρ and the bounds on the duration.
-        nodes: Inner grid points, ascending, each between 1 and N−1.
-        waypoints: (len(nodes), n) positions there (rad).
+        timetables: Grid points at which to pass the positions, inner ones, ascending; of several timetables the
+            cheapest is taken.
+        waypoints: (W, n) positions (rad).
 
     Returns:
         The motion and its objective (s).
     """
-    N = problem.intervals
-    rows = np.vstack([_end_map(N)[0], *(_reach_row(N, node)[None] for node in nodes)])
-    gram_inverse = np.linalg.inv(rows @ rows.T)
-    coasted = np.asarray(nodes, dtype=float)[:, None] / N * problem.start_velocity
+    rows, gram_inverse = _way_map(problem.intervals, tuple(tuple(nodes) for nodes in timetables))
+    at_ends, at_waypoints = _end_change(problem, 0.0), waypoints - problem.start_position
+    fixed = np.vstack([at_ends, at_waypoints])
+    shares = np.asarray(timetables, dtype=float) / problem.intervals
+    linear = np.empty((len(shares), *fixed.shape))
+    linear[:, :2] = _end_change(problem, 1.0) - at_ends
+    linear[:, 2:] = -shares[..., None] * problem.start_velocity
+    durations, costs = _best_root(_coefficients(gram_inverse, fixed, linear), problem)
+    best = int(costs.argmin())
+    duration = float(durations[best])
+    curvature = rows[best].T @ (gram_inverse[best] @ (fixed + duration * linear[best]))
+    return nearest_trajectory(problem, curvature, duration), float(costs[best])
 
-    def change(duration: float) -> Array:
-        return np.vstack([_end_change(problem, duration), waypoints - problem.start_position - duration * coasted])
 
-    fixed = change(0.0)
-    linear = change(1.0) - fixed
-    products = [np.sum(a * (gram_inverse @ b)) for a, b in ((fixed, fixed), (fixed, linear), (linear, linear))]
-    duration, cost = _best_root((float(products[0]), 2.0 * float(products[1]), float(products[2])), problem)
-    return nearest_trajectory(problem, rows.T @ (gram_inverse @ change(duration)), duration), cost
+@lru_cache(maxsize=64)
+def _way_map(intervals: int, timetables: tuple[tuple[int, ...], ...]) -> tuple[Array, Array]:
+    """(S, W+2, N+1) rows of both end values and of the positions at W grid points, and their inverse Gram matrices."""
+    ends = _end_map(intervals)[0]
+    rows = np.stack([np.vstack([ends, *(_reach_row(intervals, node) for node in nodes)]) for nodes in timetables])
+    return rows, np.linalg.inv(rows @ rows.swapaxes(-1, -2))
 
 
 def _reach_row(intervals: int, node: int) -> Array:

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.errors import InvalidProblem, OutOfReach
-from dyngrasp.models.inverse_kinematics import inverse_kinematics_for
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.planning import constraints
 from dyngrasp.planning.audit import audit
-from dyngrasp.planning.collocation.closed_form import optimum_through
+from dyngrasp.planning.collocation.descent import descent
 from dyngrasp.planning.collocation.gripper_path import GripperPath, gripper_path
 from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
 from dyngrasp.planning.collocation.residuals import rows
@@ -73,12 +72,6 @@ BACKENDS = {"structured": lambda: StructuredSolver(StructuredSettings()), "ipopt
 # Beyond this a part that stands still in the hand could hardly be held.
 LARGEST_HOLD_SAFETY = 3.0
 
-# Heights of the way points between the pre-grasp (0) and z_th (1), and so when they are passed before the end.
-_DESCENT_HEIGHTS = np.array([1.0, 0.62, 0.25])
-
-# Parts of the approach that the descent through the funnel may take; the cheapest of them is the start.
-_DESCENT_SHARES = np.linspace(0.06, 0.5, 12)
-
 
 class CollocationPlanner:
     """Plans a grasp by trapezoidal collocation with free phase durations, eq. (3)."""
@@ -117,7 +110,7 @@ class CollocationPlanner:
         """
         began = time.perf_counter()
         paths = self._gripper_paths(targets, gripper_start)
-        problems = self.phase_problems(q_start, targets, gripper_start)
+        problems = self._problems(_state(q_start), targets, paths)
         timings = {"problems": 1e3 * (time.perf_counter() - began)}
         solutions: list[Solution] = []
         for name, problem in zip(PHASE_NAMES, problems, strict=True):
@@ -170,9 +163,12 @@ class CollocationPlanner:
         self, q_start: Array | JointState, targets: GraspTargets, gripper_start: Array | None = None
     ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         """The three problems that `plan` solves, in the order of `PHASE_NAMES`; arguments as there."""
+        return self._problems(_state(q_start), targets, self._gripper_paths(targets, gripper_start))
+
+    def _problems(
+        self, start: BoundaryState, targets: GraspTargets, paths: tuple[GripperPath, ...]
+    ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         task, settings = self.task, self.settings
-        start = _state(q_start)
-        paths = self._gripper_paths(targets, gripper_start)
         bounds = [path.shortest_duration(task.gripper.velocity, task.gripper.acceleration) for path in paths]
         empty, loaded = task.robot_empty, task.robot_loaded(targets.grasp)
         torque = constraints.torque_rows(empty, settings.intervals, settings.torque_fraction)
@@ -200,38 +196,10 @@ class CollocationPlanner:
         return approach, grasp, deliver
 
     def guess(self, problem: PhaseProblem, targets: GraspTargets) -> Trajectory | None:
-        """A start for the approach that comes down the funnel; None where the solver's own start is as good.
-
-        The hand is sent through way points on the grasp axis; of several times for the descent the cheapest is taken.
-        """
-        funnels = [constraint for constraint in problem.constraints if constraint.name == "funnel"]
-        if not funnels:
+        """A start for the approach that comes down the funnel; None where the solver's own start is as good."""
+        if all(constraint.name != "funnel" for constraint in problem.constraints):
             return None
-        task = self.task
-        T_hand_grasp = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_open)
-        lowest, top = task.settings.pregrasp_distance, task.grasp_object.funnel.z_threshold
-        if top <= lowest:
-            return None
-        kinematics = inverse_kinematics_for(task.robot)
-        waypoints = []
-        q = problem.end_position
-        try:
-            for height in lowest + (top - lowest) * _DESCENT_HEIGHTS[::-1]:
-                above = targets.T_world_grasp * pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
-                q = kinematics.nearest(above * T_hand_grasp.inverse(), q)
-                waypoints.insert(0, q)
-        except OutOfReach:
-            return None
-        best: tuple[Trajectory, float] | None = None
-        for share in _DESCENT_SHARES:
-            # Square roots: the descent brakes towards the pre-grasp.
-            nodes = np.round(problem.intervals * (1 - share * np.sqrt(_DESCENT_HEIGHTS))).astype(int)
-            if np.unique(nodes).size < nodes.size or nodes[0] < 1 or nodes[-1] >= problem.intervals:
-                continue
-            found = optimum_through(problem, nodes.tolist(), np.array(waypoints))
-            if best is None or found[1] < best[1]:
-                best = found
-        return None if best is None else best[0]
+        return descent(problem, targets, self.task)
 
     def _phase(
         self,
@@ -291,12 +259,11 @@ class CollocationPlanner:
         return replace(funnel, lower=np.array([max(margin, 0.0)]))
 
     def _tube(self, targets: GraspTargets, path: GripperPath) -> NodeConstraint:
-        gripper, settings = self.task.gripper, self.task.settings
-        T_flange_grasp = gripper.T_flange_hand * gripper.T_hand_grasp(targets.gripper_closed)
+        settings = self.task.settings
         return constraints.grasp_tube(
             self.task.robot,
             self._grasp_points(path),
-            T_flange_grasp.rotation,
+            self.task.T_flange_closed(targets.grasp).rotation,
             targets.T_world_grasp,
             settings.lateral_tolerance,
             settings.dip_tolerance,
@@ -312,11 +279,10 @@ class CollocationPlanner:
 
     def _hold(self, targets: GraspTargets, safety: float) -> NodeConstraint:
         task = self.task
-        T_flange_grasp = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_closed)
         return constraints.hold(
             task.robot,
             self._T_flange_object(targets).act(task.grasp_object.spatial_inertia),
-            T_flange_grasp,
+            task.T_flange_closed(targets.grasp),
             task.pinch(targets.grasp),
             self.settings.intervals,
             safety,
@@ -331,9 +297,7 @@ class CollocationPlanner:
 
     def _T_flange_object(self, targets: GraspTargets) -> pin.SE3:
         """The part in the flange frame as the closed hand holds it."""
-        gripper = self.task.gripper
-        T_flange_grasp = gripper.T_flange_hand * gripper.T_hand_grasp(targets.gripper_closed)
-        return T_flange_grasp * targets.grasp.T_object_grasp.inverse()
+        return self.task.T_flange_closed(targets.grasp) * targets.grasp.T_object_grasp.inverse()
 
 
 def _state(q_start: Array | JointState) -> BoundaryState:
