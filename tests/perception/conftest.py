@@ -10,8 +10,7 @@ import pytest
 
 from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.catalogue import load_camera, load_object
-from dyngrasp.models.grasp_object import GraspObject
-from dyngrasp.perception.marker_detection import DICTIONARIES
+from dyngrasp.models.grasp_object import MARKER_DICTIONARIES, GraspObject
 
 FINE = 3
 MODULES, QUIET = 6, 1
@@ -82,7 +81,9 @@ def looking_down(distance: float, tilt: float = 0.0, yaw: float = 0.0, turn: flo
 @cache
 def _pattern(dictionary: str, number: int) -> np.ndarray:
     inner = cv2.aruco.generateImageMarker(
-        cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), number, MODULES * PIXELS_A_MODULE
+        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, MARKER_DICTIONARIES[dictionary])),
+        number,
+        MODULES * PIXELS_A_MODULE,
     )
     return np.pad(inner, QUIET * PIXELS_A_MODULE, constant_values=255)
 

@@ -57,9 +57,9 @@ def test_poses_from_pictures(detector, solver, casting, camera, draw):
         e = error(best.T_camera_object, T)
         errors.append([np.linalg.norm(e[:3]), np.linalg.norm(e[3:])])
         normalised.append(e @ np.linalg.solve(best.covariance, e))
-    # The settings promise 0.15 pixels a corner and axis.
-    assert np.sqrt(np.mean(np.square(corner))) < 0.15
-    # With 0.15 px at f = 909 px and markers 0.1 m apart: 0.1 mm across, 1 mm along the view at 0.6 m, 0.5°.
+    # The settings promise 0.2 pixels a corner and axis.
+    assert np.sqrt(np.mean(np.square(corner))) < 0.2
+    # With 0.2 px at f = 909 px and markers 0.1 m apart: 0.1 mm across, 1 mm along the view at 0.6 m, 0.5°.
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
     assert rms[0] < 1.0e-3
     assert rms[1] < np.deg2rad(0.5)
@@ -82,7 +82,7 @@ def test_covariance_is_that_of_least_squares(solver, camera, casting):
     weight = np.repeat([s.min() / s.max() for s in sides], 8)
     J = weight[:, None] * np.column_stack(columns)
     # Differences of pixels with a step of 1e-6 leave 1e-7 relative; the inverse multiplies that by its condition.
-    np.testing.assert_allclose(candidate.covariance, 0.15**2 * np.linalg.inv(J.T @ J), rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(candidate.covariance, 0.2**2 * np.linalg.inv(J.T @ J), rtol=1e-3, atol=1e-12)
 
 
 def test_errors_are_as_large_as_the_covariance_says(camera, casting):

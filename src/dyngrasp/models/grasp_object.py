@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,16 @@ import trimesh
 from dyngrasp.errors import ModelFileError
 from dyngrasp.models.model_file import Finite, Positive, StrictSchema, UnitQuaternion, Vector3, decode, read_toml
 from dyngrasp.signals import Array, read_only
+
+# Families of markers by the names of the model file, and what OpenCV calls them.
+MARKER_DICTIONARIES = MappingProxyType(
+    {
+        "4x4_50": "DICT_4X4_50",
+        "5x5_50": "DICT_5X5_50",
+        "6x6_50": "DICT_6X6_50",
+        "apriltag_36h11": "DICT_APRILTAG_36h11",
+    }
+)
 
 # A piece counts as convex if it fills its hull to this share: vertices are stored in single precision.
 CONVEX_SHARE = 1e-4

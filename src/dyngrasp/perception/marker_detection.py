@@ -9,15 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyngrasp.errors import InvalidProblem
-from dyngrasp.models.grasp_object import GraspObject
+from dyngrasp.models.grasp_object import MARKER_DICTIONARIES, GraspObject
 from dyngrasp.signals import Array, read_only
-
-DICTIONARIES = {
-    "4x4_50": cv2.aruco.DICT_4X4_50,
-    "5x5_50": cv2.aruco.DICT_5X5_50,
-    "6x6_50": cv2.aruco.DICT_6X6_50,
-    "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
-}
 
 
 @dataclass(frozen=True)
@@ -84,7 +77,8 @@ class MarkerDetector:
         self._ids = frozenset(marker.id for marker in part.markers)
         if not self._ids:
             raise InvalidProblem(f"{part.name} carries no markers: its model.toml needs [[markers]] to be seen")
-        dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[part.marker_dictionary])
+        family = getattr(cv2.aruco, MARKER_DICTIONARIES[part.marker_dictionary])
+        dictionary = cv2.aruco.getPredefinedDictionary(family)
         size = len(dictionary.bytesList)
         if not self._ids <= set(range(size)):
             raise InvalidProblem(

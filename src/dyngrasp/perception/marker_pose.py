@@ -41,7 +41,7 @@ class MarkerPoseSettings:
         steps: Of Gauss-Newton at most.
     """
 
-    corner_noise: float = 0.15
+    corner_noise: float = 0.2
     coarse_agreement: float = 15.0
     agreement: float = 2.0
     largest_error: float = 1.5
@@ -126,7 +126,8 @@ class MarkerPoseSolver:
             return Sighting((), seen, np.inf, False)
         corners = self._gather(detected)
         candidates: list[PoseCandidate] = []
-        for found in detected:
+        # Large squares give the best first guesses.
+        for found in sorted(detected, key=lambda found: -_area(found.corners)):
             for guess in self._square_poses(found):
                 # A guess beside a pose that several markers agree with, and all, would only end there again.
                 if any(1 < len(c.markers) == len(seen) and _close(c.T_camera_object, guess) for c in candidates):
@@ -134,6 +135,11 @@ class MarkerPoseSolver:
                 candidate = self._refine(guess, corners)
                 if candidate is not None and not any(_same(candidate, other) for other in candidates):
                     candidates.append(candidate)
+            # Both guesses of one square have been followed; with all markers in one pose the others only repeat it.
+            if len(seen) > 1 and any(
+                len(c.markers) == len(seen) and c.error < 2.0 * self.settings.corner_noise for c in candidates
+            ):
+                break
         candidates.sort(key=lambda candidate: (-len(candidate.markers), candidate.error))
         rivals = [c for c in candidates if len(c.markers) == len(candidates[0].markers)]
         # Eight residuals of six parameters are expected at half the noise of a corner; below, a ratio says nothing.
@@ -259,6 +265,12 @@ def corners_in_object(marker: Marker) -> Array:
     """(4, 3) corners of a marker in the object frame (m), in the order of `MarkerCorners`."""
     T = marker.T_object_marker
     return marker.size * UNIT_CORNERS @ T.rotation.T + T.translation
+
+
+def _area(corners: Array) -> float:
+    """Of a quadrilateral (pixels squared), half the cross product of its diagonals."""
+    (a, b), (c, d) = corners[2] - corners[0], corners[3] - corners[1]
+    return 0.5 * abs(float(a * d - b * c))
 
 
 def _same(a: PoseCandidate, b: PoseCandidate) -> bool:

@@ -91,6 +91,8 @@ def build_scene(
     grasp_object: GraspObject,
     variation: PlantVariation | None = None,
     settings: SceneSettings | None = None,
+    *,
+    markers: bool = False,
 ) -> Scene:
     """Compose and compile the world.
 
@@ -103,6 +105,7 @@ def build_scene(
         variation: How this plant deviates from the models; nominal joint friction and the part's own
             friction if None.
         settings: Numerics.
+        markers: Stick the part's markers on its faces, for cameras and pictures; they weigh and touch nothing.
 
     Raises:
         ValueError: The variation is for another number of joints.
@@ -119,6 +122,11 @@ def build_scene(
     _attach_robot(spec, robot, variation)
     _attach_gripper(spec, robot, gripper)
     _add_part(spec, grasp_object, variation)
+    if markers:
+        # Only here: whoever draws no markers needs no OpenCV.
+        from dyngrasp.simulation.marker_stickers import add_stickers
+
+        add_stickers(spec, spec.body(PART), grasp_object)
     _add_motors(spec, robot, gripper, settings)
     _set_contacts(spec, gripper, variation, settings)
     return _locate(spec.compile(), settings, robot, gripper)
