@@ -50,3 +50,12 @@ def test_a_trial_that_cannot_be_planned_is_a_row_with_its_cause():
     row = run_study(scenario, SCENARIO, trials=1, seed=0, workers=1).ordered[0]
     assert not row["success"]
     assert row["cause"].startswith("OutOfReach: ")
+
+
+def test_an_interrupted_study_keeps_its_finished_rows():
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        run_study(load_scenario(SCENARIO, QUICK), SCENARIO, trials=3, seed=3, workers=1, progress=interrupt)
+    assert len(stopped.value.args[0].rows) == 1
