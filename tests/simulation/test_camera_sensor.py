@@ -149,7 +149,7 @@ def test_motion_is_smeared_about_the_middle_of_the_exposure(marked, camera, cast
             T_world_camera * pin.SE3(np.eye(3), np.array([0.5 * (t - 0.102), 0.0, 0.0])) * before_camera(0.45, 0.2)
             for t in times
         ]
-        smeared = sensor.capture([put(state, T) for T in poses], times)
+        smeared = sensor.capture([put(state, T) for T in poses], times.tolist())
         sharp = sensor.capture([put(state, poses[4])], [times[4]])
     assert smeared.t_open == pytest.approx(0.1)
     assert smeared.t_close == pytest.approx(0.104)
