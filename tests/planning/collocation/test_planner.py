@@ -11,6 +11,7 @@ from dyngrasp.models.catalogue import load_object
 from dyngrasp.planning.collocation.gripper_path import gripper_path
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.residuals import infeasible_at_once, worst_violation
+from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTask, TaskSettings, grasp_targets
 from dyngrasp.planning.problem import Status
 from dyngrasp.signals import JointState
@@ -97,6 +98,36 @@ def test_a_moving_start_is_taken_as_it_is(planner, targets, result):
 def test_boundary_states_satisfy_the_rows_that_no_acceleration_enters(planner, targets):
     for problem in planner.phase_problems(Q_START, targets):
         assert infeasible_at_once(problem, 1e-6) == ""
+
+
+class CountingSolver:
+    """The default solver; notes which phases it was asked for."""
+
+    def __init__(self):
+        self.solver, self.asked = StructuredSolver(), []
+
+    def solve(self, problem, guess=None):
+        self.asked.append(problem)
+        return self.solver.solve(problem, guess)
+
+
+@pytest.mark.parametrize(
+    ("phase", "row", "bare"),
+    [("approach", "funnel", {"funnel_margin": 0.0}), ("deliver", "hold", {"hold_safety": 1.0})],
+)
+def test_a_row_that_keeps_too_little_in_hand_is_tightened_until_the_audit_passes(task, targets, phase, row, bare):
+    solver = CountingSolver()
+    planner = CollocationPlanner(task, CollocationSettings(effort_weight=1e-3, **bare), solver)
+    result = planner.plan(Q_START, targets)
+    assert result.ok, result.message
+    asked = [problem for problem in solver.asked if problem.name == phase]
+    assert 2 <= len(asked) <= 4
+    # The last solution is the one in the plan, and it satisfies the tighter row that was missing before.
+    first, last = asked[0], asked[-1]
+    used = result.require().arm[PHASE_NAMES.index(phase)]
+    assert worst_violation(last, used)[0] < 1e-6
+    assert worst_violation(last, solver.solver.solve(first, used).require())[1] == row
+    assert result.phases[PHASE_NAMES.index(phase)].objective > solver.solver.solve(first, used).objective
 
 
 def test_a_phase_without_time_stops_the_plan_there(task, targets):

@@ -97,7 +97,7 @@ def effort_coefficients(problem: PhaseProblem) -> Array:
 
 
 def _coefficients(gram_inverse: Array, fixed: Array, linear: Array) -> Array:
-    """(..., 3) of the least Σ|a_k|² that changes what the rows of a map say by fixed + T linear, each (..., rows, n)."""
+    """(..., 3) of the least Σ|a_k|² with which the rows of a map give fixed + T linear, each (..., rows, n)."""
     by_fixed, by_linear = gram_inverse @ fixed, gram_inverse @ linear
     products = (fixed * by_fixed, 2.0 * linear * by_fixed, linear * by_linear)
     return np.stack([product.sum(axis=(-2, -1)) for product in products], axis=-1)
@@ -129,7 +129,7 @@ def _best_root(coefficients: Array, problem: PhaseProblem) -> tuple[Array, Array
     companion = np.zeros((*coefficients.shape[:-1], 4, 4))
     companion[..., 1:, :-1] = np.eye(3)
     companion[..., 0, 1:] = weight * coefficients[..., ::-1] * (1.0, 2.0, 3.0)
-    roots = np.linalg.eigvals(companion).real
+    roots = np.asarray(np.linalg.eigvals(companion).real, dtype=float)
     shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
     ends = np.broadcast_to([shortest, problem.max_duration], (*roots.shape[:-1], 2))
     # Complex pairs come with their real parts too: J decides, so a candidate too many does no harm.
@@ -177,7 +177,7 @@ def _way_map(intervals: int, timetables: tuple[tuple[int, ...], ...]) -> tuple[A
     """(S, W+2, N+1) rows of both end values and of the positions at W grid points, and their inverse Gram matrices."""
     ends = _end_map(intervals)[0]
     rows = np.stack([np.vstack([ends, *(_reach_row(intervals, node) for node in nodes)]) for nodes in timetables])
-    return rows, np.linalg.inv(rows @ rows.swapaxes(-1, -2))
+    return rows, np.asarray(np.linalg.inv(rows @ rows.swapaxes(-1, -2)), dtype=float)
 
 
 def _reach_row(intervals: int, node: int) -> Array:

@@ -42,7 +42,7 @@ class CollocationSettings:
             which has to track the plan with a model that is not exact.
         position_margin: Distance kept from the position limits (rad), less where a boundary state is closer.
         funnel_margin: h ≥ this at the grid points of the approach (m) at N = 100, because between them the hand cuts
-            corners: by up to 1.3 mm, and by the square of the step on other grids.
+            corners, by the square of the step on other grids; raised where the audit finds that it cuts deeper.
         hold_safety: Factor by which the pinch exceeds what the part asks of it while it is carried; raised where the
             audit finds that velocities add more than this covers.
         max_duration: Longest approach and longest delivery (s).
@@ -69,8 +69,39 @@ class CollocationSettings:
 BACKENDS = {"structured": lambda: StructuredSolver(StructuredSettings()), "ipopt": lambda: IpoptSolver(IpoptSettings())}
 """Solvers of one phase by name."""
 
+
+@dataclass(frozen=True)
+class _Reserves:
+    """What rows keep in hand for what they leave out.
+
+    Attributes:
+        funnel: Margin of h for the chords between the grid points (m).
+        hold: Factor on the pinch for what velocities add to the wrench of the part.
+    """
+
+    funnel: float
+    hold: float
+
+    def raised(self, report: AuditReport) -> _Reserves | None:
+        """Larger by what the audit found missing; None if that is nothing, or more than reserves can help."""
+        missing = {entry.name: entry.worst for entry in report.failures}
+        if not missing or not missing.keys() <= _PHASE_OF_RESERVE.keys():
+            return None
+        if self.funnel >= LARGEST_FUNNEL_MARGIN or self.hold >= LARGEST_HOLD_SAFETY:
+            return None
+        # A little more than was missing: the new motion differs from the one that was looked at.
+        return _Reserves(
+            self.funnel - 1.3 * missing.get("funnel", 0.0), self.hold * 1.02 * max(missing.get("hold", 0.0), 1 / 1.02)
+        )
+
+
+_PHASE_OF_RESERVE = {"funnel": 0, "hold": 2}
+
 # Beyond this a part that stands still in the hand could hardly be held.
 LARGEST_HOLD_SAFETY = 3.0
+
+# The pre-grasp itself stands 20 mm above the tip of the funnel (m).
+LARGEST_FUNNEL_MARGIN = 0.015
 
 
 class CollocationPlanner:
@@ -109,8 +140,8 @@ class CollocationPlanner:
             The plan if every phase converged and the audit passed; else what went wrong, as a status.
         """
         began = time.perf_counter()
-        paths = self._gripper_paths(targets, gripper_start)
-        problems = self._problems(_state(q_start), targets, paths)
+        start, paths, reserves = _state(q_start), self._gripper_paths(targets, gripper_start), self._reserves
+        problems = self._problems(start, targets, paths, reserves)
         timings = {"problems": 1e3 * (time.perf_counter() - began)}
         solutions: list[Solution] = []
         for name, problem in zip(PHASE_NAMES, problems, strict=True):
@@ -121,15 +152,15 @@ class CollocationPlanner:
                 timings["total"] = 1e3 * (time.perf_counter() - began)
                 return PlanResult(solution.status, None, tuple(solutions), None, timings, solution.message)
         plan, report = self._audited(solutions, paths, targets, start_time, timings)
-        safety = self.settings.hold_safety
-        while [entry.name for entry in report.failures] == ["hold"] and safety < LARGEST_HOLD_SAFETY:
-            # The rows leave out what velocities add to the part's wrench: ask for as much more as was missing.
-            safety *= 1.02 * report["hold"].worst
-            tighter = self.solver.solve(self._with_hold(problems[2], targets, safety), solutions[2].trajectory)
-            timings["deliver"] += tighter.timings_ms.get("total", 0.0)
-            if not tighter.ok:
+        while (raised := reserves.raised(report)) is not None:
+            reserves, problems = raised, self._problems(start, targets, paths, raised)
+            again = {}
+            for phase in (_PHASE_OF_RESERVE[entry.name] for entry in report.failures):
+                again[phase] = self.solver.solve(problems[phase], solutions[phase].trajectory)
+                timings[PHASE_NAMES[phase]] += again[phase].timings_ms.get("total", 0.0)
+            if not all(solution.ok for solution in again.values()):
                 break
-            solutions[2] = tighter
+            solutions = [again.get(phase, solution) for phase, solution in enumerate(solutions)]
             plan, report = self._audited(solutions, paths, targets, start_time, timings)
         timings["total"] = 1e3 * (time.perf_counter() - began)
         if report.ok:
@@ -163,17 +194,23 @@ class CollocationPlanner:
         self, q_start: Array | JointState, targets: GraspTargets, gripper_start: Array | None = None
     ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         """The three problems that `plan` solves, in the order of `PHASE_NAMES`; arguments as there."""
-        return self._problems(_state(q_start), targets, self._gripper_paths(targets, gripper_start))
+        paths = self._gripper_paths(targets, gripper_start)
+        return self._problems(_state(q_start), targets, paths, self._reserves)
+
+    @property
+    def _reserves(self) -> _Reserves:
+        settings = self.settings
+        return _Reserves(settings.funnel_margin * (100 / settings.intervals) ** 2, settings.hold_safety)
 
     def _problems(
-        self, start: BoundaryState, targets: GraspTargets, paths: tuple[GripperPath, ...]
+        self, start: BoundaryState, targets: GraspTargets, paths: tuple[GripperPath, ...], reserves: _Reserves
     ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         task, settings = self.task, self.settings
         bounds = [path.shortest_duration(task.gripper.velocity, task.gripper.acceleration) for path in paths]
         empty, loaded = task.robot_empty, task.robot_loaded(targets.grasp)
         torque = constraints.torque_rows(empty, settings.intervals, settings.torque_fraction)
         approach = self._phase("approach", start, targets.pregrasp, (torque,), bounds[0], settings.max_duration)
-        approach = replace(approach, constraints=(torque, self._funnel(approach, targets, paths[0])))
+        approach = replace(approach, constraints=(torque, self._funnel(approach, targets, paths[0], reserves.funnel)))
         longest = task.settings.grasp_duration_max
         if bounds[1] > longest:
             raise InvalidProblem(
@@ -189,7 +226,7 @@ class CollocationPlanner:
         )
         carry = (
             constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction),
-            self._hold(targets, settings.hold_safety),
+            self._hold(targets, reserves.hold),
             self._above_ground(targets),
         )
         deliver = self._phase("deliver", targets.grasped, targets.place, carry, 0.0, settings.max_duration)
@@ -246,7 +283,7 @@ class CollocationPlanner:
         T = gripper.T_flange_hand
         return gripper.grasp_point_many(path.position) @ T.rotation.T + T.translation
 
-    def _funnel(self, problem: PhaseProblem, targets: GraspTargets, path: GripperPath) -> NodeConstraint:
+    def _funnel(self, problem: PhaseProblem, targets: GraspTargets, path: GripperPath, margin: float) -> NodeConstraint:
         """The funnel with its margin, or with what the boundary states leave of it."""
         funnel = constraints.funnel(
             self.task.robot, self._grasp_points(path), targets.T_world_grasp, self.task.grasp_object.funnel
@@ -254,8 +291,7 @@ class CollocationPlanner:
         ends = np.vstack([problem.start_position, problem.end_position])
         at_ends = replace(funnel, parameters=funnel.parameters[[0, -1]])
         # A little less than the ends have, so that an interior point remains.
-        wanted = self.settings.funnel_margin * (100 / self.settings.intervals) ** 2
-        margin = min(wanted, 0.9 * float(rows(at_ends, ends, np.zeros_like(ends)).min()))
+        margin = min(margin, 0.9 * float(rows(at_ends, ends, np.zeros_like(ends)).min()))
         return replace(funnel, lower=np.array([max(margin, 0.0)]))
 
     def _tube(self, targets: GraspTargets, path: GripperPath) -> NodeConstraint:
@@ -268,13 +304,6 @@ class CollocationPlanner:
             settings.lateral_tolerance,
             settings.dip_tolerance,
             settings.tilt_tolerance,
-        )
-
-    def _with_hold(self, problem: PhaseProblem, targets: GraspTargets, safety: float) -> PhaseProblem:
-        tighter = self._hold(targets, safety)
-        # In its place: solvers keep their functions by the order of the rows.
-        return replace(
-            problem, constraints=tuple(tighter if rows.name == "hold" else rows for rows in problem.constraints)
         )
 
     def _hold(self, targets: GraspTargets, safety: float) -> NodeConstraint:
