@@ -4,7 +4,9 @@ Free mode: Mehrotra's predictor–corrector chooses the barrier parameter anew i
 boundary are taken as long as the error estimate E falls within a few iterations. Monotone mode: the barrier parameter
 is fixed until its problem is solved, and Armijo's rule on the barrier merit function accepts steps. Where a free step
 raises E it is taken back and the monotone mode goes on, until E is a tenth (Nocedal, Wächter, Waltz 2009,
-"Adaptive barrier update strategies for nonlinear interior methods"). In monotone mode every step is a descent step of a
+"Adaptive barrier update strategies for nonlinear interior methods"). A given start that lies between curved walls, as
+in a funnel, would be thrown out of them by the first free steps: it begins in monotone mode and the free one only
+speeds up the end. In monotone mode every step is a descent step of a
 smooth function bounded below, hence the iterates approach its stationary points (Gould, Orban, Toint 2015, for elastic
 rows). Where such a point violates a row, the violation alone is minimised; if it cannot be brought to zero the problem
 is reported as infeasible.
@@ -32,6 +34,7 @@ KEEP = 0.995  # a step takes at most this share of a slack or multiplier
 MEMORY = 5  # iterations within which E must fall in free mode
 FALL = 0.9999  # by which factor
 ENOUGH = 0.1  # by which factor it must fall in monotone mode before the free one is tried again
+NEAR = 3e-3  # E, relative to the objective, below which a cautious start may leave monotone mode
 ARMIJO = 1e-4
 ROUNDING = 1e-13  # of the merit, relative
 SHORTEST = 1e-10  # step length at which the line search gives up
@@ -76,6 +79,7 @@ class InteriorPoint:
         deadline: float = np.inf,
         barrier: float = 1e-3,
         multipliers: Array | None = None,
+        cautious: bool = False,
     ) -> tuple[Outcome, Best, int]:
         """Minimise from x (N−1, n) and T.
 
@@ -86,6 +90,7 @@ class InteriorPoint:
             deadline: A value of `time.perf_counter`; the best iterate until then is returned.
             barrier: μ at the start, relative to the objective.
             multipliers: Of the rows at the solution of a problem nearby, for a warm start.
+            cautious: Whether to begin in monotone mode, so that the start is not left far behind.
 
         Returns:
             How it ended, the best iterate, and the number of Newton systems.
@@ -101,7 +106,7 @@ class InteriorPoint:
         self.price = settings.price * self.unit
         self.first_mu = barrier * self.unit
         self.best = Best(self.x.copy(), T)
-        self.slow_limit = SLOW
+        self.slow_limit, self.cautious = SLOW, cautious
         self._restart(1.0, 0)
         if multipliers is not None:
             self.mu = settings.warm_barrier * self.unit
@@ -163,13 +168,14 @@ class InteriorPoint:
         return Outcome.ITERATION_LIMIT, self.best, settings.max_iterations
 
     def _restart(self, factor: float, iteration: int) -> None:
-        """Slacks and multipliers for the present point, in free mode; `factor` weighs the objective."""
+        """Slacks and multipliers for the present point, and the first mode; `factor` weighs the objective."""
         settings = self.settings
         self.model.factor = factor
         self.mu = self.first_mu
         self.model.values(self.x, self.T, self.g)
         rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
-        self.free, self.history, self.reference, self.mean = settings.adaptive, [], np.inf, self.mu
+        self.free, self.history, self.mean = settings.adaptive and not self.cautious, [], self.mu
+        self.reference = NEAR * self.unit if self.cautious else np.inf
         self.last_shift, self.slow = 0.0, 0
         self.least_violation, self.since = np.inf, iteration
 

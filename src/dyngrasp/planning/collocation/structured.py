@@ -130,7 +130,9 @@ class StructuredSolver:
         barrier = settings.initial_barrier if guess is None else settings.guess_barrier
         deadline = began + settings.time_limit
         x, T = model.map.unknowns(start), start.duration
-        outcome, best, iterations = method.solve(model, x, T, deadline, barrier, known)
+        outcome, best, iterations = method.solve(
+            model, x, T, deadline, barrier, known, cautious=guess is not None and known is None
+        )
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
