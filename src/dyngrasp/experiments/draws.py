@@ -67,11 +67,11 @@ def _believed(T_world_object: pin.SE3, part: GraspObject, pose: PoseSection, rng
     ball = _direction(rng) * rng.uniform() ** (1 / 3)
     turn = _direction(rng) * rng.uniform()
     heading, side = rng.uniform(-np.pi, np.pi), rng.choice([-1.0, 1.0])
-    if pose.source == "noise" and pose.draw == "planar":
+    if pose.source != "truth" and pose.draw == "planar":
         R_grasp = (T_world_object * part.grasps[0].T_object_grasp).rotation
         offset = offset + 1e-3 * pose.position_mm * (R_grasp.T @ np.array([np.cos(heading), np.sin(heading), 0.0]))
         turn = side * np.deg2rad(pose.rotation_deg) * R_grasp[2]
-    elif pose.source == "noise":
+    elif pose.source != "truth":
         offset = offset + 1e-3 * pose.position_mm * ball
         turn = np.deg2rad(pose.rotation_deg) * turn
     else:

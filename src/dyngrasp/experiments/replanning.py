@@ -42,13 +42,18 @@ def replanner_for(task: GraspTask, section: ReplannerSection, planner: Collocati
 
 
 def replanning_loop(
-    workcell: Workcell, trial: Trial, plan: GraspPlan, targets: GraspTargets, planner: CollocationPlanner
+    workcell: Workcell,
+    trial: Trial,
+    plan: GraspPlan,
+    targets: GraspTargets,
+    planner: CollocationPlanner,
+    source: PoseSource | None = None,
 ) -> ReplanningLoop | None:
-    """The loop of a trial; None if the scenario keeps the first plan."""
+    """The loop of a trial; None if the scenario keeps the first plan. `source` is the camera where there is one."""
     section = workcell.scenario.replanner
     if not section.enabled:
         return None
-    source = pose_source(workcell.scenario.pose, trial, targets.grasp)
+    source = source or pose_source(workcell.scenario.pose, trial, targets.grasp)
     latency = None if section.latency_ms == "measured" else 1e-3 * float(section.latency_ms)
     replanner = replanner_for(workcell.task, section, planner)
     if latency is None:

@@ -15,6 +15,7 @@ from dyngrasp.models.model_file import Finite, NonNegative, StrictSchema, decode
 from dyngrasp.planning.grasp_targets import TaskSettings
 
 __all__ = [
+    "CameraSection",
     "Range",
     "Scenario",
     "PartSection",
@@ -138,10 +139,11 @@ class PoseSection(StrictSchema):
     their signs. With `draw = "planar"` the error is exactly `position_mm` in a random horizontal direction and exactly
     `rotation_deg` about the vertical, to either side.
 
-    The remaining keys say what a camera on the hand would reveal to a replanner, see `PoseNoiseSettings`.
+    With `source = "camera"` the first pose is off in the same way, and then the replanner is told what the table
+    `[camera]` sees. The remaining keys are for `"noise"`: what a camera would reveal, see `PoseNoiseSettings`.
     """
 
-    source: Literal["truth", "noise"] = "truth"
+    source: Literal["truth", "noise", "camera"] = "truth"
     position_mm: NonNegative = 0.0
     rotation_deg: NonNegative = 0.0
     along_mm: Finite = 0.0
@@ -162,6 +164,34 @@ class PoseSection(StrictSchema):
             (self.position_mm, self.rotation_deg, self.along_mm, self.across_mm, self.up_mm)
         ):
             raise ValueError('no errors with source = "truth"; set source = "noise"')
+        return self
+
+
+class CameraSection(StrictSchema):
+    """`[camera]`: pictures of the running simulation, for `pose.source = "camera"`.
+
+    Without `width` and `height` they are as large as the camera's own. `exposures` moments of each exposure are drawn
+    and averaged, which is its motion blur. `latency_ms` is from the end of the exposure to the pose in the filter. Each
+    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction.
+    """
+
+    model: str = "ava1000"
+    width: Annotated[int, Field(ge=64, le=4096)] | None = None
+    height: Annotated[int, Field(ge=64, le=4096)] | None = None
+    exposures: Annotated[int, Field(ge=1, le=32)] = 1
+    latency_ms: NonNegative = 12.0
+    brightness: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
+    noise: NonNegative = 1.5
+    vignetting: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
+    mount_mm: NonNegative = 0.0
+    mount_deg: NonNegative = 0.0
+    prior_mm: Annotated[float, Field(gt=0.0)] = 30.0
+    prior_deg: Annotated[float, Field(gt=0.0)] = 10.0
+
+    @model_validator(mode="after")
+    def _both_sides(self) -> Self:
+        if (self.width is None) != (self.height is None):
+            raise ValueError("width and height: both or neither")
         return self
 
 
@@ -213,6 +243,7 @@ class Scenario(StrictSchema):
     part: PartSection
     planner: PlannerSection = PlannerSection()
     pose: PoseSection = PoseSection()
+    camera: CameraSection = CameraSection()
     replanner: ReplannerSection = ReplannerSection()
     plant: PlantSection = PlantSection()
     render: RenderSection = RenderSection()

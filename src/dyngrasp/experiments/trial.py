@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from dyngrasp.closed_loop.camera_poses import FrameReport
 from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_episode
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.closed_loop.replanning_loop import ReplanEvent
@@ -18,11 +20,13 @@ from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.metrics import Outcome, judge
 from dyngrasp.experiments.provenance import versions
 from dyngrasp.experiments.replanning import replanning_loop, replanning_summary
+from dyngrasp.experiments.vision import camera_poses, films, vision_summary
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.grasp_targets import GraspTargets, ranked_grasp_targets
 from dyngrasp.planning.problem import PlanResult
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
+from dyngrasp.simulation.plant import TruthfulPlant
 from dyngrasp.simulation.scene import Scene, SceneSettings, build_scene
 from dyngrasp.trajectory import GraspPlan
 
@@ -42,7 +46,7 @@ class PlannedTrial:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedTrial:
-    """What happened in the plant, the verdict on it, the plan that was carried out in the end, and every replan."""
+    """What happened in the plant, the verdict, the plan carried out in the end, every replan and every picture."""
 
     record: EpisodeRecord
     outcome: Outcome
@@ -50,6 +54,7 @@ class ExecutedTrial:
     plan: GraspPlan
     targets: GraspTargets
     replans: tuple[ReplanEvent, ...] = ()
+    frames: tuple[FrameReport, ...] = ()
 
 
 def planner_for(workcell: Workcell) -> CollocationPlanner:
@@ -102,24 +107,29 @@ def execute_trial(
     task, plan = workcell.task, planned.result.require()
     period = 1.0 / workcell.scenario.plant.control_rate_hz
     settings = SceneSettings(timestep=min(SceneSettings().timestep, period))
-    scene = build_scene(task.robot, task.gripper, task.grasp_object, trial.variation, settings)
-    plant = MujocoPlant(
+    scene = build_scene(task.robot, task.gripper, task.grasp_object, trial.variation, settings, markers=films(workcell))
+    plant: TruthfulPlant = MujocoPlant(
         scene, plan.arm[0].position[0], plan.gripper[0].position[0], trial.T_world_object, t=plan.start_time
     )
     controller = grasp_controller(task, planned.targets.grasp, period)
-    loop = replanning_loop(workcell, trial, plan, planned.targets, planner or planner_for(workcell))
-    record = run_episode(
-        plan,
-        plant,
-        controller,
-        EpisodeSettings(control_period=period),
-        replanning=loop,
-        progress=progress,
-        meta={"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()},
-    )
+    with ExitStack() as stack:
+        vision = stack.enter_context(camera_poses(workcell, trial, plan, scene)) if films(workcell) else None
+        if vision is not None:
+            plant = vision.filmed(plant)
+        loop = replanning_loop(workcell, trial, plan, planned.targets, planner or planner_for(workcell), vision)
+        record = run_episode(
+            plan,
+            plant,
+            controller,
+            EpisodeSettings(control_period=period),
+            replanning=loop,
+            progress=progress,
+            meta={"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()},
+        )
+    frames = () if vision is None else tuple(vision.frames)
     plan, targets, events = (plan, planned.targets, ()) if loop is None else (loop.newest, loop.targets, loop.events)
     outcome = judge(plan, record, task, targets.grasp)
-    return ExecutedTrial(record, outcome, scene, plan, targets, tuple(events))
+    return ExecutedTrial(record, outcome, scene, plan, targets, tuple(events), frames)
 
 
 def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None) -> dict[str, Any]:
@@ -130,6 +140,7 @@ def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None)
         "cause": executed.outcome.cause if executed else f"planning: {result.status}: {result.message}",
         "criteria": executed.outcome.summary() if executed else {},
         "replanning": replanning_summary(executed.replans) if executed else {},
+        "vision": vision_summary(executed.frames) if executed else {},
         "phases": result.plan.durations.tolist() if result.plan else [],
         "planning_ms": planned.planning_ms,
         "planning_attempts": planned.attempts,

@@ -1,0 +1,109 @@
+"""From the `[camera]` table of a scenario to poses out of pictures, and from the pictures to figures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from dyngrasp.closed_loop.camera_poses import CameraPoses, CameraPosesSettings, FrameReport
+from dyngrasp.experiments.draws import Trial
+from dyngrasp.experiments.workcell import Workcell
+from dyngrasp.models.camera import CameraModel
+from dyngrasp.models.catalogue import load_camera
+from dyngrasp.perception.marker_detection import MarkerDetector
+from dyngrasp.perception.marker_pose import MarkerPoseSolver
+from dyngrasp.perception.pose_filter import PoseFilterSettings
+from dyngrasp.signals import PoseEstimate
+from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
+from dyngrasp.simulation.scene import Scene
+from dyngrasp.trajectory import GraspPlan
+
+# Of all random streams of a trial this one belongs to the pictures: the others stay what they are without them.
+_IMAGE_STREAM = 8
+
+# After the planned grasp by so much (s) no more pictures are taken: a replanned grasp may come a little later, and once
+# the fingers hold the part nobody asks where it is.
+_AFTER_GRASP = 0.5
+
+# From which the part is seen on the way to it (m).
+_VIEWING_DISTANCE = 0.4
+
+
+def films(workcell: Workcell) -> bool:
+    """Whether a trial takes pictures: only a replanner looks at them."""
+    return workcell.scenario.pose.source == "camera" and workcell.scenario.replanner.enabled
+
+
+@contextmanager
+def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene) -> Iterator[CameraPoses]:
+    """The camera of a scenario on the hand of a scene that shows the markers.
+
+    Args:
+        workcell: Scenario and models.
+        trial: What is believed of the part at first, and the seed.
+        plan: The first plan; says when the grasp is.
+        scene: Built with `markers=True`.
+
+    Raises:
+        RenderingUnavailable: The machine cannot draw off screen.
+        UnknownName: No such camera.
+        InvalidProblem: The part carries no markers.
+    """
+    section, task = workcell.scenario.camera, workcell.task
+    true = load_camera(section.model)
+    if section.width is not None and section.height is not None:
+        true = true.scaled(section.width, section.height)
+    streams = np.random.SeedSequence(trial.seed, spawn_key=(_IMAGE_STREAM,)).spawn(2)
+    believed = _misplaced(true, 1e-3 * section.mount_mm, np.deg2rad(section.mount_deg), streams[0])
+    deviations = np.repeat([1e-3 * section.prior_mm, np.deg2rad(section.prior_deg)], 3)
+    prior = PoseEstimate(
+        trial.T_world_object_believed, np.diag(deviations**2), plan.start_time, plan.start_time
+    )  # fmt: skip
+    imaging = ImagingSettings(
+        brightness=section.brightness,
+        noise=section.noise,
+        vignetting=section.vignetting,
+        seed=int(streams[1].generate_state(1)[0]),
+    )
+    # What every frame has in common: the mount's error, seen from the distance at which the part is approached, and a
+    # floor for the grid of pixels. A calibration knows how large the former is.
+    turn = np.deg2rad(section.mount_deg)
+    shared = (np.hypot(1e-3 * section.mount_mm, turn * _VIEWING_DISTANCE) + 2e-4, turn + np.deg2rad(0.05))
+    pose_filter = replace(PoseFilterSettings.still(), shared_error=(float(shared[0]), float(shared[1])))
+    settings = CameraPosesSettings(
+        filter=pose_filter,
+        latency=1e-3 * section.latency_ms,
+        exposures=section.exposures,
+        until=plan.start_time + float(np.sum(plan.durations[:2])) + _AFTER_GRASP,
+    )
+    detector = MarkerDetector(task.grasp_object)
+    with CameraSensor(scene, true, imaging) as sensor:
+        solver = MarkerPoseSolver(believed, task.grasp_object)
+        yield CameraPoses(sensor, believed, task.robot, task.gripper, detector, solver, prior, settings)
+
+
+def vision_summary(frames: Sequence[FrameReport]) -> dict[str, Any]:
+    """Pictures of an episode: how many, what the filter said, how many showed the part."""
+    if not frames:
+        return {}
+    return {
+        "frames": len(frames),
+        "recognised": sum(frame.verdict is not None for frame in frames),
+        "verdicts": dict(Counter(frame.verdict.value for frame in frames if frame.verdict is not None)),
+        "markers_mean": float(np.mean([len(frame.seen) for frame in frames])),
+    }
+
+
+def _misplaced(camera: CameraModel, shift: float, turn: float, stream: np.random.SeedSequence) -> CameraModel:
+    """The camera as a calibration believes it that is wrong by a shift (m) and a turn (rad) in random directions."""
+    rng = np.random.default_rng(stream)
+    directions = rng.normal(size=(2, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    error = pin.SE3(pin.exp3(turn * directions[1]), shift * directions[0])
+    return replace(camera, T_hand_camera=camera.T_hand_camera * error)
