@@ -8,6 +8,7 @@ import pytest
 
 from dyngrasp.errors import InvalidProblem, PlanningFailed
 from dyngrasp.models.catalogue import load_object
+from dyngrasp.planning.collocation.closed_form import best_duration, least_cost
 from dyngrasp.planning.collocation.gripper_path import gripper_path
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.residuals import infeasible_at_once, worst_violation
@@ -86,6 +87,26 @@ def test_approach_starts_from_a_guess_down_the_funnel(planner, targets):
     assert violation < 0.7
     assert planner.guess(grasp, targets) is None
     assert planner.guess(deliver, targets) is None
+
+
+def test_approaches_down_the_funnel_take_few_iterations(task):
+    planner = CollocationPlanner(task)
+    start = np.deg2rad([55, 39.5, -6.6, -22, -36.3, 110.6, 134])
+    random = np.random.default_rng(3)
+    iterations = []
+    for _ in range(15):
+        pose = pin.SE3(
+            pin.utils.rotate("z", random.uniform(-np.pi, np.pi)),
+            np.array([random.uniform(0.6, 0.7), random.uniform(-0.1, 0.1), task.grasp_object.rest_height]),
+        )
+        targets = grasp_targets(pose, task, start)
+        approach, _, _ = planner.phase_problems(start, targets)
+        solution = planner.solver.solve(approach, planner.guess(approach, targets))
+        assert solution.ok, solution.message
+        assert solution.objective >= least_cost(approach, best_duration(approach)) * (1 - 1e-9)
+        iterations.append(solution.iterations)
+    # With free steps at the start, which leave the funnel, the median is 18.
+    assert np.median(iterations) <= 14, iterations
 
 
 def test_a_moving_start_is_taken_as_it_is(planner, targets, result):

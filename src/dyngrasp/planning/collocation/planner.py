@@ -14,7 +14,7 @@ from dyngrasp.planning.audit import audit
 from dyngrasp.planning.collocation.descent import descent
 from dyngrasp.planning.collocation.gripper_path import GripperPath, gripper_path
 from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
-from dyngrasp.planning.collocation.residuals import rows
+from dyngrasp.planning.collocation.node_functions import node_functions
 from dyngrasp.planning.collocation.structured import StructuredSettings, StructuredSolver
 from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask
 from dyngrasp.planning.problem import (
@@ -289,9 +289,10 @@ class CollocationPlanner:
             self.task.robot, self._grasp_points(path), targets.T_world_grasp, self.task.grasp_object.funnel
         )
         ends = np.vstack([problem.start_position, problem.end_position])
-        at_ends = replace(funnel, parameters=funnel.parameters[[0, -1]])
+        at_ends = np.empty((2, 1))
+        node_functions(funnel).values(ends, np.zeros_like(ends), funnel.parameters[[0, -1]], at_ends, 0)
         # A little less than the ends have, so that an interior point remains.
-        margin = min(margin, 0.9 * float(rows(at_ends, ends, np.zeros_like(ends)).min()))
+        margin = min(margin, 0.9 * float(at_ends.min()))
         return replace(funnel, lower=np.array([max(margin, 0.0)]))
 
     def _tube(self, targets: GraspTargets, path: GripperPath) -> NodeConstraint:
