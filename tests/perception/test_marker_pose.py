@@ -116,6 +116,8 @@ def test_one_marker_from_the_front_has_two_poses(solver, camera, casting, draw, 
     # Three markers decide what one could not.
     all_seen = solver.solve(detector.detect(draw(T)))
     assert not all_seen.ambiguous
+    assert all_seen.plausible == all_seen.candidates[:1]
+    assert sighting.plausible == sighting.candidates
     assert np.linalg.norm(error(all_seen.candidates[0].T_camera_object, T)[3:]) < np.deg2rad(1)
 
 

@@ -252,6 +252,18 @@ def test_a_consistent_row_begins_even_if_the_wrong_pose_came_first():
     assert np.linalg.norm(error(pose_filter.estimate(k * FRAME), T)) < np.deg2rad(1)
 
 
+def test_a_vague_pose_does_not_win_by_being_vague():
+    # One marker's pose beside that of three: its distance in standard deviations is as small, its knowledge is not.
+    random = np.random.default_rng(8)
+    T = pin.SE3.Identity()
+    wrong = pin.SE3(pin.exp3(np.array([0.4, 0.0, 0.0])), np.array([0.03, 0.0, 0.0]))
+    pose_filter = PoseFilter(STILL)
+    for k in range(4):
+        t = k * FRAME
+        pose_filter.update((PoseEstimate(wrong, 900 * R, t, t), measure(random, T, t)))
+    assert np.linalg.norm(error(pose_filter.estimate(t), T)) < np.deg2rad(1)
+
+
 def test_without_measurements_the_uncertainty_grows():
     random = np.random.default_rng(5)
     poses, _ = true_motion(random, MOVING, 20)

@@ -72,6 +72,13 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
         "--against", metavar="NAMES", default="", help="general solvers: ipopt, osqp, piqp, piqp_multistage, clarabel"
     )
     bench_replan.add_argument("--json", metavar="FILE", help="write all rows, with machine and versions")
+    bench_perception = benchmarks.add_parser("perception", help="from pictures to poses: times and accuracy")
+    bench_perception.add_argument("--runs", type=_count, metavar="N", default=10, help="a distance; default: 10")
+    bench_perception.add_argument(
+        "--seed", type=_seed, metavar="S", default=0, help="draws views and noise; default: 0"
+    )
+    bench_perception.add_argument("--small", action="store_true", help="pictures of 640 x 480 in place of 1024 x 1024")
+    bench_perception.add_argument("--json", metavar="FILE", help="write all rows, with machine and versions")
 
     commands.add_parser("models", help="list robots, grippers and objects")
 

@@ -19,6 +19,8 @@ def bench(options: argparse.Namespace) -> int:
     """Measure, print the tables, write the JSON. A benchmark is done and good whatever it found."""
     if options.benchmark == "replan":
         return _replan(options)
+    if options.benchmark == "perception":
+        return _perception(options)
     console = _console()
     if options.json:
         check_writable(options.json)
@@ -46,6 +48,31 @@ def _console() -> Console:
     """The terminal as it is; in a file or a pipe lines are long enough for the widest table."""
     console = Console()
     return console if console.is_terminal else Console(width=140)
+
+
+def _perception(options: argparse.Namespace) -> int:
+    from dyngrasp.experiments.bench_perception import bench_perception
+
+    console = _console()
+    if options.json:
+        check_writable(options.json)
+    resolution = (640, 480) if options.small else None
+    with console.status("…") as status:
+        rows = bench_perception(options.runs, options.seed, resolution, progress=status.update)
+    for accuracy, title in ((False, "from a picture to a pose"), (True, "a part at rest, against the truth")):
+        chosen = [row for row in rows if (row["stage"] == "accuracy") is accuracy]
+        table = Table(title=title)
+        for name in chosen[0]:
+            table.add_column(name, justify="right")
+        for row in chosen:
+            table.add_row(*(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
+        console.print(table)
+    if options.json:
+        arguments = {"runs": options.runs, "seed": options.seed}
+        document = {"benchmark": "perception", "arguments": arguments, "machine": machine(), "versions": versions()}
+        write_json(options.json, document | {"rows": rows})
+        console.print(f"written to {options.json}")
+    return DELIVERED
 
 
 def _replan(options: argparse.Namespace) -> int:

@@ -171,7 +171,7 @@ class CameraPoses:
         receipt = moments[-1][0] + s.latency
         candidates = tuple(
             replace(c, covariance=s.correlation * c.covariance).in_world(T_world_camera, image.t_capture, receipt)
-            for c in sighting.candidates
+            for c in sighting.plausible
             if self._passes(c, sighting)
         )
         report = FrameReport(image.t_capture, receipt, sighting.seen, sighting.ratio, None)
@@ -181,7 +181,7 @@ class CameraPoses:
         if len(candidate.markers) >= self.settings.least_markers:
             return True
         tilt = float(np.sqrt(np.linalg.eigvalsh(candidate.covariance[3:, 3:])[-1]))
-        return not sighting.ambiguous and candidate is sighting.candidates[0] and tilt <= self.settings.largest_tilt
+        return not sighting.ambiguous and tilt <= self.settings.largest_tilt
 
     def _receive(self, pending: _Pending) -> None:
         report = pending.report

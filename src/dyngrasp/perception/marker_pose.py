@@ -97,12 +97,14 @@ class Sighting:
         ratio: Reprojection error of the second candidate with as many markers over that of the first; infinite if
             there is none.
         ambiguous: Whether that ratio is too small to decide by.
+        plausible: The first candidates, those that the reprojection error cannot tell apart: a filter may choose.
     """
 
     candidates: tuple[PoseCandidate, ...]
     seen: tuple[int, ...]
     ratio: float
     ambiguous: bool
+    plausible: tuple[PoseCandidate, ...] = ()
 
 
 class MarkerPoseSolver:
@@ -145,7 +147,9 @@ class MarkerPoseSolver:
         # Eight residuals of six parameters are expected at half the noise of a corner; below, a ratio says nothing.
         floor = 0.5 * self.settings.corner_noise
         ratio = max(rivals[1].error, floor) / max(rivals[0].error, floor) if len(rivals) > 1 else np.inf
-        return Sighting(tuple(candidates), seen, float(ratio), bool(ratio < self.settings.clear_ratio))
+        clear = self.settings.clear_ratio
+        plausible = tuple(c for c in rivals if max(c.error, floor) < clear * max(rivals[0].error, floor))
+        return Sighting(tuple(candidates), seen, float(ratio), bool(ratio < clear), plausible)
 
     def _gather(self, detected: Sequence[MarkerCorners]) -> _Corners:
         measured = np.stack([found.corners for found in detected])

@@ -107,7 +107,7 @@ class _Track:
     def __init__(self, first: PoseEstimate, settings: PoseFilterSettings, limit: float) -> None:
         self._settings, self._limit = settings, limit
         self._steps = [_Step(begin(first, settings.motion), (first,))]
-        self.frames, self.distance = 1, 0.0
+        self.frames, self.total_surprise = 1, 0.0
 
     @property
     def newest(self) -> float:
@@ -128,7 +128,7 @@ class _Track:
         best, distance = nearest(predicted, candidates)
         if not distance <= self._limit:
             return np.inf
-        return distance + float(np.linalg.slogdet(predicted.covariance[:6, :6] + best.covariance)[1])
+        return distance + _spread(predicted, best)
 
     def take(self, candidates: Candidates) -> bool:
         """Take in the candidate that fits best if it passes the gate."""
@@ -138,6 +138,7 @@ class _Track:
         if not distance <= self._limit:
             return False
         place = bisect_right(self._steps, t, key=lambda step: step.state.t)
+        self.total_surprise += distance + _spread(predicted, best)
         state = correct(predicted, best)
         later = self._steps[place:]
         self._steps[place:] = [_Step(state, candidates)]
@@ -146,7 +147,6 @@ class _Track:
             state = correct(state, nearest(state, step.candidates)[0])
             self._steps.append(_Step(state, step.candidates))
         self.frames += 1
-        self.distance += distance
         self._forget()
         return True
 
@@ -272,9 +272,14 @@ class PoseFilter:
         ripe = [track for track in self._challengers if track.frames >= self.settings.acquire_frames]
         if not ripe:
             return Verdict.GATED
-        self._track = min(ripe, key=lambda track: track.distance)
+        self._track = min(ripe, key=lambda track: track.total_surprise)
         self._challengers = []
         return Verdict.ACQUIRED
+
+
+def _spread(state: TrackState, estimate: PoseEstimate) -> float:
+    """Log determinant of the innovation's covariance: without it whatever knows little would always fit best."""
+    return float(np.linalg.slogdet(state.covariance[:6, :6] + estimate.covariance)[1])
 
 
 def nearest(state: TrackState, candidates: Candidates) -> tuple[PoseEstimate, float]:
