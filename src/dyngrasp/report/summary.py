@@ -40,6 +40,10 @@ def run_table(summary: dict[str, Any]) -> Table:
         table.add_row(f"  {name}", f"{duration:.3f} s", "")
     table.add_row("  whole motion", f"{sum(phases):.3f} s", "")
     table.add_row("  planning", f"{summary['planning_ms']:.1f} ms", _attempts(summary["planning_attempts"]))
+    replanning = summary.get("replanning")
+    if replanning:
+        published = f"{replanning['published']} of {replanning['replans']}"
+        table.add_row("  plans replaced", published, f"median {replanning['median_ms']:.1f} ms a cycle")
     criteria = summary["criteria"]
     if criteria:
         table.add_row("Criteria", "", "passes when")
