@@ -200,6 +200,7 @@ def bench_plan(
             for trial, (T, q_start) in enumerate(_draws(case, task, planner, trials, seed)):
                 if trial == 0:
                     progress(f"{case}, ρ = {weight:g}: compiling what is missing")
+                    _plan(case, weight, 0, planner, T, q_start, task)
                     _phases(case, weight, 0, planner, T, q_start, task, solvers)
                 progress(f"{case}, ρ = {weight:g}: {trial + 1} of {trials}")
                 stages += _plan(case, weight, trial, planner, T, q_start, task)
