@@ -1,28 +1,12 @@
-"""The arm, the hand and the part that come with the package, and a plant of them."""
+"""Worlds and plants of the arm, the hand and the part that come with the package."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
 from dyngrasp.simulation.scene import SceneSettings, build_scene
 from dyngrasp.simulation.variation import PlantVariation
-
-
-@pytest.fixture(scope="session")
-def robot():
-    return load_robot("iiwa14")
-
-
-@pytest.fixture(scope="session")
-def gripper():
-    return load_gripper("sdh2")
-
-
-@pytest.fixture(scope="session")
-def casting():
-    return load_object("casting")
 
 
 @pytest.fixture(scope="session")
