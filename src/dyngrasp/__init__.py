@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from dyngrasp.planning.grasp_targets import TaskSettings as TaskSettings
     from dyngrasp.planning.grasp_targets import grasp_targets as grasp_targets
     from dyngrasp.planning.problem import Status as Status
+    from dyngrasp.planning.replanning.replanner import Replanner as Replanner
+    from dyngrasp.planning.replanning.target_update import updated_targets as updated_targets
     from dyngrasp.trajectory import GraspPlan as GraspPlan
     from dyngrasp.trajectory import Trajectory as Trajectory
 
@@ -36,9 +38,11 @@ _HOMES = {
     "GraspTask": "dyngrasp.planning.grasp_targets",
     "TaskSettings": "dyngrasp.planning.grasp_targets",
     "grasp_targets": "dyngrasp.planning.grasp_targets",
+    "Replanner": "dyngrasp.planning.replanning.replanner",
     "Status": "dyngrasp.planning.problem",
     "GraspPlan": "dyngrasp.trajectory",
     "Trajectory": "dyngrasp.trajectory",
+    "updated_targets": "dyngrasp.planning.replanning.target_update",
 }
 
 __all__ = ["__version__", *_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
