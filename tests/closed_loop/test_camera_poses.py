@@ -12,6 +12,7 @@ from dyngrasp.errors import InvalidProblem, RenderingUnavailable
 from dyngrasp.models.catalogue import load_camera, load_gripper, load_object, load_robot
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
+from dyngrasp.perception.part_tracker import PartTracker, PartTrackerSettings
 from dyngrasp.perception.pose_filter import Verdict
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation import gl_backend
@@ -46,11 +47,9 @@ class Stage:
         """A source that believes the part 20 mm and 3° beside its place."""
         wrong = self.T_part * pin.exp6(np.array([0.012, -0.016, 0.0, 0.0, 0.0, 0.05])) if T_first is None else T_first
         prior = PoseEstimate(wrong, np.diag(np.repeat([0.03, 0.17], 3) ** 2), 0.0, 0.0)
-        believed = believed or self.camera
-        detector, solver = MarkerDetector(self.part), MarkerPoseSolver(believed, self.part)
-        return CameraPoses(
-            self.sensor, believed, self.robot, self.gripper, detector, solver, prior, CameraPosesSettings(**settings)
-        )
+        solver = MarkerPoseSolver(believed or self.camera, self.part)
+        tracker = PartTracker(solver, self.robot, self.gripper, prior)
+        return CameraPoses(self.sensor, MarkerDetector(self.part), tracker, CameraPosesSettings(**settings))
 
     def run(self, poses, duration, speed=None, state=None):
         """Let the arm move uniformly (rad/s) with the camera watching, and ask at the end."""
@@ -87,8 +86,10 @@ def test_the_part_is_found_while_the_hand_moves(stage):
     assert position < 1.5e-3
     assert angle < np.deg2rad(0.5)
     # Pictures at 30 Hz, to the control period; captured 1 ms after the shutter opened.
-    np.testing.assert_allclose([frame.t_capture for frame in poses.frames], np.arange(9) / 30 + 1e-3, atol=1.001e-3)
-    assert {frame.verdict for frame in poses.frames} == {Verdict.ACCEPTED}
+    reports = poses.tracker.reports
+    captures = [report.frame.t_capture for report in reports]
+    np.testing.assert_allclose(captures, np.arange(9) / 30 + 1e-3, atol=1.001e-3)
+    assert {report.verdict for report in reports} == {Verdict.ACCEPTED}
     # The encoders' positions of 30 ms later, at 0.1 m/s, would have been off by three times that bound.
     late = stage.camera_at(ABOVE + speed * 0.03).translation - stage.camera_at(ABOVE).translation
     assert np.linalg.norm(late) > 2e-3
@@ -98,13 +99,13 @@ def test_nothing_is_known_before_it_has_arrived(stage):
     poses = stage.poses(latency=0.020)
     prior = poses.estimate(stage.truth, 0.0)
     # Exposure of 2 ms, then 20 ms.
-    assert stage.run(poses, 0.021) is prior
-    assert not poses.frames
+    assert stage.run(poses, 0.021).T_world_object == prior.T_world_object
+    assert not poses.tracker.reports
     estimate = poses.estimate(stage.truth, 0.0225)
-    assert estimate is not prior
     assert error(estimate, stage.T_part)[0] < 4e-3
-    assert poses.frames[0].t_capture == pytest.approx(1e-3)
-    assert poses.frames[0].t_receipt == pytest.approx(0.022)
+    (report,) = poses.tracker.reports
+    assert report.frame.t_capture == pytest.approx(1e-3)
+    assert report.frame.t_receipt == pytest.approx(0.022)
 
 
 def test_an_error_of_the_mount_goes_into_the_pose(stage):
@@ -122,24 +123,46 @@ def test_what_is_not_seen_stays_as_it_was_believed(stage):
     away[stage.scene.part_qpos] += 1.0
     poses = stage.poses()
     prior = poses.estimate(stage.truth, 0.0)
-    assert stage.run(poses, 0.15, state=away) is prior
-    assert len(poses.frames) == 5
-    assert all(frame.verdict is None and frame.seen == () for frame in poses.frames)
+    late = stage.run(poses, 0.15, state=away)
+    assert late.T_world_object == prior.T_world_object
+    # And it is known no better, but a little worse.
+    assert np.linalg.eigvalsh(late.covariance - prior.covariance)[0] > 0
+    reports = poses.tracker.reports
+    assert len(reports) == 5
+    assert all(report.verdict is None and report.frame.seen == () for report in reports)
 
 
 def test_pictures_end_where_nobody_asks_any_more(stage):
     poses = stage.poses(until=0.05)
     stage.run(poses, 0.2)
-    assert len(poses.frames) == 2
+    assert len(poses.tracker.reports) == 2
+
+
+def test_pictures_are_kept_as_they_were_taken(stage):
+    poses = stage.poses(keep_every=2)
+    stage.run(poses, 0.15)
+    assert list(poses.pictures) == [0, 2, 4]
+    detector = MarkerDetector(stage.part)
+    for number, picture in poses.pictures.items():
+        found, expected = detector.detect(picture), poses.tracker.reports[number].frame.markers
+        assert [marker.id for marker in found] == [marker.id for marker in expected] != []
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(one.corners, other.corners)
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [{"latency": -1.0}, {"exposures": 0}, {"least_markers": 0}, {"correlation": 0.5}, {"largest_deviation": 0.0}],
+    ("kind", "settings"),
+    [
+        (CameraPosesSettings, {"latency": -1.0}),
+        (CameraPosesSettings, {"exposures": 0}),
+        (CameraPosesSettings, {"keep_every": -1}),
+        (PartTrackerSettings, {"least_markers": 0}),
+        (PartTrackerSettings, {"correlation": 0.5}),
+    ],
 )
-def test_impossible_settings_are_refused(settings):
+def test_impossible_settings_are_refused(kind, settings):
     with pytest.raises(InvalidProblem):
-        CameraPosesSettings(**settings)
+        kind(**settings)
 
 
 @pytest.mark.slow

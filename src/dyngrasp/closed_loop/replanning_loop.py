@@ -10,11 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from dyngrasp.closed_loop.pose_source import PoseSource
 from dyngrasp.errors import InvalidProblem
+from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
+from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.plant import Truth
 from dyngrasp.trajectory import GraspPlan
 
@@ -26,16 +29,21 @@ class ReplanningSettings:
     Attributes:
         rate: How often a replan starts (Hz); the paper: 10.
         latency: From question to answer (s); None takes what the answer really took on this machine.
+        largest_deviation: Standard deviation of the grasp point (m) above which an estimate is not taken: the running
+            plan goes on. A part that nobody sees any more is known less and less.
     """
 
     rate: float = 10.0
     latency: float | None = 0.020
+    largest_deviation: float = np.inf
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.rate) and self.rate > 0):
             raise InvalidProblem(f"the replanning rate must be > 0, got {self.rate} Hz")
         if self.latency is not None and not (np.isfinite(self.latency) and self.latency >= 0):
             raise InvalidProblem(f"the latency must be ≥ 0, got {self.latency} s")
+        if not self.largest_deviation > 0:
+            raise InvalidProblem(f"largest_deviation must be > 0 m, got {self.largest_deviation}")
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,8 @@ class ReplanningLoop:
         """
         self.settings = settings or ReplanningSettings()
         self.events: list[ReplanEvent] = []
+        self.not_taken: list[float] = []
+        """Times at which a replan was due but the estimate too uncertain (s)."""
         self._replanner, self._source = replanner, source
         self._running, self._next, self._targets = plan, plan, targets
         self._asked: ReplanEvent | None = None
@@ -104,6 +114,9 @@ class ReplanningLoop:
             self._running = self._next
         if ask and self._asked is None:
             estimate = self._source.estimate(truth, t)
+            if grasp_point_deviation(estimate, self._targets.grasp) > self.settings.largest_deviation:
+                self.not_taken.append(t)
+                return self._running
             result = self._replanner.replan_to_pose(self._next, self._targets, estimate, t)
             took = 1e-3 * result.timings_ms["total"] if self.settings.latency is None else self.settings.latency
             if self.settings.latency is not None and result.path is Path.FRESH:
@@ -124,3 +137,10 @@ class ReplanningLoop:
         # agree there.
         if event.result.ok and not event.late:
             self._next, self._targets = event.result.plan, event.result.targets
+
+
+def grasp_point_deviation(estimate: PoseEstimate, grasp: Grasp) -> float:
+    """Standard deviation (m) of where the grasp point is, along the direction in which it is known least."""
+    # T·exp(δ) moves the point p of the object by ρ + θ × p, in the object's axes.
+    lever = np.hstack([np.eye(3), -pin.skew(grasp.T_object_grasp.translation)])
+    return float(np.sqrt(np.linalg.eigvalsh(lever @ estimate.covariance @ lever.T)[-1]))

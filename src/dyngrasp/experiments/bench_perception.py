@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.closed_loop.camera_poses import CameraPosesSettings
 from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.catalogue import load_camera, load_gripper, load_object, load_robot
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
+from dyngrasp.perception.part_tracker import PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilter, PoseFilterSettings
 from dyngrasp.signals import Array
 from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
@@ -66,7 +66,7 @@ def bench_perception(
     detector, solver = MarkerDetector(part), MarkerPoseSolver(camera, part)
     resting = MujocoPlant(scene, POSTURE, gripper.open_posture, pin.SE3.Identity()).state
     settings = replace(PoseFilterSettings.still(), acquire_frames=3, shared_error=SHARED)
-    correlation = CameraPosesSettings().correlation
+    correlation = PartTrackerSettings().correlation
     rng = np.random.default_rng(seed)
     times: dict[str, list[float]] = {"detect": [], "pose": [], "filter": [], "frame": []}
     rows = []

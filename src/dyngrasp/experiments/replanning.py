@@ -47,25 +47,30 @@ def replanning_loop(
     plan: GraspPlan,
     targets: GraspTargets,
     planner: CollocationPlanner,
-    source: PoseSource | None = None,
+    camera: PoseSource | None = None,
 ) -> ReplanningLoop | None:
-    """The loop of a trial; None if the scenario keeps the first plan. `source` is the camera where there is one."""
+    """The loop of a trial; None if the scenario keeps the first plan. `camera` is the source where there is one."""
     section = workcell.scenario.replanner
     if not section.enabled:
         return None
-    source = source or pose_source(workcell.scenario.pose, trial, targets.grasp)
+    source = camera or pose_source(workcell.scenario.pose, trial, targets.grasp)
     latency = None if section.latency_ms == "measured" else 1e-3 * float(section.latency_ms)
     replanner = replanner_for(workcell.task, section, planner)
     if latency is None:
         # What is compiled or loaded at the first call would count as latency of the first replan.
         replanner.replan(plan, targets, plan.start_time)
-    return ReplanningLoop(replanner, source, plan, targets, ReplanningSettings(section.rate_hz, latency))
+    # The noise model's covariance is that of one draw of its own; what a camera says of itself may be judged.
+    bound = 1e-3 * workcell.scenario.camera.largest_deviation_mm if camera is not None else np.inf
+    return ReplanningLoop(
+        replanner, source, plan, targets, ReplanningSettings(section.rate_hz, latency, largest_deviation=bound)
+    )
 
 
 def pose_source(section: PoseSection, trial: Trial, grasp: Grasp) -> PoseSource:
     """What the loop is told of the part's pose."""
+    moving = section.motion != "still"
     if section.source == "truth":
-        return TruePoses()
+        return TruePoses(moving)
     T_object_grasp = grasp.T_object_grasp
     error = (trial.T_world_object * T_object_grasp).actInv(trial.T_world_object_believed * T_object_grasp)
     settings = PoseNoiseSettings(
@@ -77,22 +82,27 @@ def pose_source(section: PoseSection, trial: Trial, grasp: Grasp) -> PoseSource:
         frame_angle=np.deg2rad(section.frame_deg),
     )
     seed = int(np.random.SeedSequence(trial.seed, spawn_key=(_POSE_STREAM,)).generate_state(1, np.uint64)[0])
-    return NoisyPoses(PoseNoise(error, T_object_grasp, settings, seed))
+    return NoisyPoses(PoseNoise(error, T_object_grasp, settings, seed), moving)
 
 
-def replanning_summary(events: Sequence[ReplanEvent]) -> dict[str, Any]:
-    """How the replans of an episode ended: counts by way and status, reasons, times (ms)."""
-    if not events:
+def replanning_summary(events: Sequence[ReplanEvent], not_taken: Sequence[float] = ()) -> dict[str, Any]:
+    """How the replans of an episode ended: counts by way and status, reasons, times (ms).
+
+    `too_uncertain` counts the updates that were not taken because of the estimate's covariance; see `not_taken` of
+    `ReplanningLoop`.
+    """
+    if not events and not not_taken:
         return {}
     times = np.array([event.result.timings_ms["total"] for event in events])
     return {
         "replans": len(events),
         "published": sum(event.result.ok and not event.late for event in events),
         "late": sum(event.late for event in events),
+        "too_uncertain": len(not_taken),
         "paths": dict(Counter(str(event.result.path) for event in events)),
         "kept_because": dict(Counter(event.result.message for event in events if not event.result.ok)),
-        "median_ms": float(np.median(times)),
-        "max_ms": float(times.max()),
+        "median_ms": float(np.median(times)) if events else None,
+        "max_ms": float(times.max()) if events else None,
     }
 
 

@@ -31,7 +31,7 @@ __all__ = [
 OVERRIDE = "--set"
 """What errors name in place of a file when the offending value came from an override."""
 
-_MODEL_KEYS = ("robot", "gripper", "object")
+_MODEL_KEYS = {"task": ("robot", "gripper", "object"), "camera": ("model",)}
 
 
 def _as_range(value: Any) -> Any:
@@ -140,7 +140,8 @@ class PoseSection(StrictSchema):
     `rotation_deg` about the vertical, to either side.
 
     With `source = "camera"` the first pose is off in the same way, and then the replanner is told what the table
-    `[camera]` sees. The remaining keys are for `"noise"`: what a camera would reveal, see `PoseNoiseSettings`.
+    `[camera]` sees. `motion` says what is known of the part beforehand: whether its velocity is estimated at all. The
+    remaining keys are for `"noise"`: what a camera would reveal, see `PoseNoiseSettings`.
     """
 
     source: Literal["truth", "noise", "camera"] = "truth"
@@ -158,6 +159,7 @@ class PoseSection(StrictSchema):
     frame_mm: NonNegative = 0.2
     frame_deg: NonNegative = 0.05
 
+    motion: Literal["still", "constant_velocity"] = "still"
     @model_validator(mode="after")
     def _truth_is_exact(self) -> Self:
         if self.source == "truth" and any(
@@ -172,7 +174,9 @@ class CameraSection(StrictSchema):
 
     Without `width` and `height` they are as large as the camera's own. `exposures` moments of each exposure are drawn
     and averaged, which is its motion blur. `latency_ms` is from the end of the exposure to the pose in the filter. Each
-    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction.
+    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction. While the grasp
+    point is known worse than to `largest_deviation_mm` the replanner takes no updates. `dyngrasp run` keeps one picture
+    of `keep_every`; 0 keeps none.
     """
 
     model: str = "ava1000"
@@ -203,6 +207,8 @@ class ReplannerSection(StrictSchema):
     """
 
     enabled: bool = False
+    largest_deviation_mm: Annotated[float, Field(gt=0.0)] = 5.0
+    keep_every: Annotated[int, Field(ge=0)] = 3
     rate_hz: Annotated[float, Field(gt=0.0, le=100.0)] = 10.0
     budget_ms: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
     latency_ms: NonNegative | Literal["measured"] = 20.0
@@ -281,11 +287,10 @@ def _read(path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
         document = read_toml(path)
     except ModelFileError as error:
         raise ScenarioError(error.file, error.key, error.value, error.expected) from error
-    task = document.get("task")
-    if isinstance(task, dict):
-        for key in _MODEL_KEYS:
-            if key in task:
-                task[key] = _resolved(task[key], path.parent)
+    for name, keys in _MODEL_KEYS.items():
+        table = document.get(name)
+        if isinstance(table, dict):
+            table |= {key: _resolved(table[key], path.parent) for key in keys if key in table}
     parent = document.pop("extends", None)
     if parent is None:
         return document
@@ -320,7 +325,7 @@ def _apply(document: dict[str, Any], override: str) -> str:
         if not isinstance(here, dict):
             raise ScenarioError(OVERRIDE, key, text, f"`{'.'.join(tables[: depth + 1])}` is a value, not a table")
     value = _value(key, text.strip())
-    if tables == ["task"] and last in _MODEL_KEYS:
+    if len(tables) == 1 and last in _MODEL_KEYS.get(tables[0], ()):
         value = _resolved(value, Path.cwd())
     here[last] = value
     return key

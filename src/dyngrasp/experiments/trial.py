@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.closed_loop.camera_poses import FrameReport
 from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_episode
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.closed_loop.replanning_loop import ReplanEvent
@@ -22,6 +21,7 @@ from dyngrasp.experiments.provenance import versions
 from dyngrasp.experiments.replanning import replanning_loop, replanning_summary
 from dyngrasp.experiments.vision import camera_poses, films, vision_summary
 from dyngrasp.experiments.workcell import Workcell
+from dyngrasp.perception.part_tracker import FrameReport
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.grasp_targets import GraspTargets, ranked_grasp_targets
 from dyngrasp.planning.problem import PlanResult
@@ -58,6 +58,7 @@ class ExecutedTrial:
 
 
 def planner_for(workcell: Workcell) -> CollocationPlanner:
+    not_taken: tuple[float, ...] = ()
     """The planner that a scenario asks for; it keeps its compiled functions, so make one a process."""
     section = workcell.scenario.planner
     settings = CollocationSettings(
@@ -126,10 +127,12 @@ def execute_trial(
             progress=progress,
             meta={"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()},
         )
-    frames = () if vision is None else tuple(vision.frames)
-    plan, targets, events = (plan, planned.targets, ()) if loop is None else (loop.newest, loop.targets, loop.events)
+    frames = () if vision is None else tuple(vision.tracker.reports)
+    targets, events, not_taken = planned.targets, (), ()
+    if loop is not None:
+        plan, targets, events, not_taken = loop.newest, loop.targets, tuple(loop.events), tuple(loop.not_taken)
     outcome = judge(plan, record, task, targets.grasp)
-    return ExecutedTrial(record, outcome, scene, plan, targets, tuple(events), frames)
+    return ExecutedTrial(record, outcome, scene, plan, targets, events, not_taken, frames)
 
 
 def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None) -> dict[str, Any]:
@@ -139,7 +142,7 @@ def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None)
         "success": executed is not None and executed.outcome.success,
         "cause": executed.outcome.cause if executed else f"planning: {result.status}: {result.message}",
         "criteria": executed.outcome.summary() if executed else {},
-        "replanning": replanning_summary(executed.replans) if executed else {},
+        "replanning": replanning_summary(executed.replans, executed.not_taken) if executed else {},
         "vision": vision_summary(executed.frames) if executed else {},
         "phases": result.plan.durations.tolist() if result.plan else [],
         "planning_ms": planned.planning_ms,

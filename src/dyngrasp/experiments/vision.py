@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.closed_loop.camera_poses import CameraPoses, CameraPosesSettings, FrameReport
+from dyngrasp.closed_loop.camera_poses import CameraPoses, CameraPosesSettings
 from dyngrasp.experiments.draws import Trial
+from dyngrasp.experiments.scenario import Scenario
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.catalogue import load_camera
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
+from dyngrasp.perception.part_tracker import FrameReport, PartTracker, PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilterSettings
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
@@ -56,47 +58,65 @@ def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene
         InvalidProblem: The part carries no markers.
     """
     section, task = workcell.scenario.camera, workcell.task
-    true = load_camera(section.model)
-    if section.width is not None and section.height is not None:
-        true = true.scaled(section.width, section.height)
+    true = scenario_camera(workcell.scenario)
     streams = np.random.SeedSequence(trial.seed, spawn_key=(_IMAGE_STREAM,)).spawn(2)
     believed = _misplaced(true, 1e-3 * section.mount_mm, np.deg2rad(section.mount_deg), streams[0])
     deviations = np.repeat([1e-3 * section.prior_mm, np.deg2rad(section.prior_deg)], 3)
-    prior = PoseEstimate(
-        trial.T_world_object_believed, np.diag(deviations**2), plan.start_time, plan.start_time
-    )  # fmt: skip
+    prior = PoseEstimate(trial.T_world_object_believed, np.diag(deviations**2), plan.start_time, plan.start_time)
     imaging = ImagingSettings(
         brightness=section.brightness,
         noise=section.noise,
         vignetting=section.vignetting,
         seed=int(streams[1].generate_state(1)[0]),
     )
+    settings = CameraPosesSettings(
+        latency=1e-3 * section.latency_ms,
+        exposures=section.exposures,
+        start=plan.start_time,
+        until=plan.start_time + float(np.sum(plan.durations[:2])) + _AFTER_GRASP,
+        keep_every=section.keep_every,
+    )
+    detector = MarkerDetector(task.grasp_object)
+    solver = MarkerPoseSolver(believed, task.grasp_object)
+    tracker = PartTracker(solver, task.robot, task.gripper, prior, tracker_settings(workcell.scenario))
+    with CameraSensor(scene, true, imaging) as sensor:
+        yield CameraPoses(sensor, detector, tracker, settings)
+
+
+def scenario_camera(scenario: Scenario) -> CameraModel:
+    """The camera of a scenario, with pictures of the size that it asks for.
+
+    Raises:
+        UnknownName: No such camera.
+        ModelFileError: Its file cannot be used.
+    """
+    section = scenario.camera
+    camera = load_camera(section.model)
+    if section.width is None or section.height is None:
+        return camera
+    return camera.scaled(section.width, section.height)
+
+
+def tracker_settings(scenario: Scenario) -> PartTrackerSettings:
+    """How the part is followed: what the scenario says of its motion and of the calibration."""
+    section = scenario.camera
+    pose_filter = PoseFilterSettings.still() if scenario.pose.motion == "still" else PoseFilterSettings()
     # What every frame has in common: the mount's error, seen from the distance at which the part is approached, and a
     # floor for the grid of pixels. A calibration knows how large the former is.
     turn = np.deg2rad(section.mount_deg)
     shared = (np.hypot(1e-3 * section.mount_mm, turn * _VIEWING_DISTANCE) + 2e-4, turn + np.deg2rad(0.05))
-    pose_filter = replace(PoseFilterSettings.still(), shared_error=(float(shared[0]), float(shared[1])))
-    settings = CameraPosesSettings(
-        filter=pose_filter,
-        latency=1e-3 * section.latency_ms,
-        exposures=section.exposures,
-        until=plan.start_time + float(np.sum(plan.durations[:2])) + _AFTER_GRASP,
-    )
-    detector = MarkerDetector(task.grasp_object)
-    with CameraSensor(scene, true, imaging) as sensor:
-        solver = MarkerPoseSolver(believed, task.grasp_object)
-        yield CameraPoses(sensor, believed, task.robot, task.gripper, detector, solver, prior, settings)
+    return PartTrackerSettings(filter=replace(pose_filter, shared_error=(float(shared[0]), float(shared[1]))))
 
 
-def vision_summary(frames: Sequence[FrameReport]) -> dict[str, Any]:
+def vision_summary(reports: Sequence[FrameReport]) -> dict[str, Any]:
     """Pictures of an episode: how many, what the filter said, how many showed the part."""
-    if not frames:
+    if not reports:
         return {}
     return {
-        "frames": len(frames),
-        "recognised": sum(frame.verdict is not None for frame in frames),
-        "verdicts": dict(Counter(frame.verdict.value for frame in frames if frame.verdict is not None)),
-        "markers_mean": float(np.mean([len(frame.seen) for frame in frames])),
+        "frames": len(reports),
+        "recognised": sum(report.verdict is not None for report in reports),
+        "verdicts": dict(Counter(report.verdict.value for report in reports if report.verdict is not None)),
+        "markers_mean": float(np.mean([len(report.frame.seen) for report in reports])),
     }
 
 

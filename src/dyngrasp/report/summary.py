@@ -43,7 +43,10 @@ def run_table(summary: dict[str, Any]) -> Table:
     replanning = summary.get("replanning")
     if replanning:
         published = f"{replanning['published']} of {replanning['replans']}"
-        table.add_row("  plans replaced", published, f"median {replanning['median_ms']:.1f} ms a cycle")
+        median = replanning["median_ms"]
+        table.add_row("  plans replaced", published, "" if median is None else f"median {median:.1f} ms a cycle")
+        if replanning["too_uncertain"]:
+            table.add_row("  updates not taken", str(replanning["too_uncertain"]), "pose too uncertain")
     criteria = summary["criteria"]
     if criteria:
         table.add_row("Criteria", "", "passes when")
