@@ -53,7 +53,7 @@ def everything(iiwa, sdh2, T_flange_grasp, states) -> list[NodeConstraint]:
         constraints.torque_rows(iiwa.with_payload(PART), N, 0.9),
         constraints.funnel(iiwa, points, T, FUNNEL),
         constraints.grasp_tube(iiwa, points, T_flange_grasp.rotation, T),
-        constraints.hold(iiwa, PART, T_flange_grasp, PINCH, N),
+        constraints.hold(iiwa, PART, T_flange_grasp, PINCH, states[1]),
     ]
 
 
@@ -121,17 +121,19 @@ def test_grasp_tube_rows(iiwa, T_flange_grasp, states):
 
 
 def test_hold_is_the_wrench_of_the_part_shared_by_two_pads(iiwa, T_flange_grasp, states):
-    constraint = constraints.hold(iiwa, PART, T_flange_grasp, PINCH, N, safety=1.5, closing_share=0.4)
+    w = np.random.default_rng(8).uniform(-2, 2, (N + 1, iiwa.n))
+    constraint = constraints.hold(iiwa, PART, T_flange_grasp, PINCH, w, safety=1.5, closing_share=0.4)
     model, data = iiwa.pin_model, iiwa.pin_model.createData()
-    for q, v in zip(*states, strict=True):
-        pin.forwardKinematics(model, data, q, np.zeros(7), v)
+    for k, (q, v) in enumerate(zip(*states, strict=True)):
+        pin.forwardKinematics(model, data, q, w[k], v)
         pin.updateFramePlacement(model, data, iiwa.tip_id)
         acceleration = pin.getFrameAcceleration(model, data, iiwa.tip_id, pin.LOCAL)
         acceleration.linear -= data.oMf[iiwa.tip_id].rotation.T @ model.gravity.linear
-        wrench = T_flange_grasp.actInv(PART * acceleration)
+        velocity = pin.getFrameVelocity(model, data, iiwa.tip_id, pin.LOCAL)
+        wrench = T_flange_grasp.actInv(PART * acceleration + velocity.cross(PART * velocity))
         expected = [load - (normal / 1.5) ** 2 for load, normal in pad_loads(wrench.linear, wrench.angular, PINCH)]
         expected.append(wrench.linear[1] / PINCH.force)
-        np.testing.assert_allclose(evaluate(constraint, q, v), expected, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(evaluate(constraint, q, v, k), expected, rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(constraint.upper, [0.0, 0.0, 0.4])
 
 
@@ -209,4 +211,4 @@ def test_functions_are_built_once_for_all_payloads_and_poses(iiwa, sdh2, T_flang
 @pytest.mark.parametrize("bad", [{"safety": 0.9}, {"closing_share": 1.0}])
 def test_senseless_hold_is_refused(iiwa, T_flange_grasp, bad):
     with pytest.raises(InvalidProblem, match="safety"):
-        constraints.hold(iiwa, PART, T_flange_grasp, PINCH, N, **bad)
+        constraints.hold(iiwa, PART, T_flange_grasp, PINCH, np.zeros((N + 1, 7)), **bad)

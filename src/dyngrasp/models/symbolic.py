@@ -159,17 +159,18 @@ def full_inverse_dynamics(robot: RobotModel) -> ca.Function:
 
 
 def payload_wrench(robot: RobotModel) -> ca.Function:
-    """(q (n,), v (n,), payload (10,)) → force (3,), moment (3,) about the flange origin, in flange axes (N, Nm).
+    """(q (n,), w (n,), v (n,), payload (10,)) → force (3,), moment (3,) about the flange origin, in flange axes.
 
-    What the flange exerts on a payload for q̈ = v at q̇ = 0, its weight included: the last link of the recursion of
-    `torque`.
+    In N and Nm: what the flange exerts on a payload, its weight included: the last link of the recursion of
+    `full_inverse_dynamics`.
     """
 
     def build() -> ca.Function:
-        q, v = ca.SX.sym("q", robot.n), ca.SX.sym("v", robot.n)
+        q, w, v = (ca.SX.sym(name, robot.n) for name in ("q", "w", "v"))
         payload = ca.SX.sym("payload", PAYLOAD_SIZE)
-        wrench = _Body.from_parameters(payload).wrench(*_motions(robot, q, ca.SX.zeros(robot.n), v)[-1])
-        return ca.Function("payload_wrench", [q, v, payload], list(wrench), ["q", "v", "payload"], ["force", "moment"])
+        wrench = _Body.from_parameters(payload).wrench(*_motions(robot, q, w, v)[-1])
+        names = ["q", "w", "v", "payload"]
+        return ca.Function("payload_wrench", [q, w, v, payload], list(wrench), names, ["force", "moment"])
 
     return _cached(robot, "payload_wrench", build)
 

@@ -130,13 +130,14 @@ def hold(
     part: pin.Inertia,
     T_flange_grasp: pin.SE3,
     pinch: Pinch,
-    intervals: int,
-    safety: float = 1.5,
+    velocity: ArrayLike,
+    safety: float = 1.4,
     closing_share: float = 0.5,
 ) -> NodeConstraint:
     """The pinch carries the part: what each pad bears under the part's acceleration, see `models.pinch.pad_loads`.
 
-    The wrench that the part needs at G is taken with q̇ = 0, as in the torque rows. Rows: for each pad its load less
+    A fast delivery loads the pads as much by its velocities as by its accelerations. They enter as given numbers, as
+    rows are functions of q and v alone: those of a motion near the one that is sought. Rows: for each pad its load less
     what its normal force allows, ≤ 0 with the safety factor; and the force along the closing axis over N, which
     shifts load from one pad to the other.
 
@@ -145,18 +146,19 @@ def hold(
         part: Inertia of the part in the flange frame.
         T_flange_grasp: The grasp frame in the flange frame as the closed hand holds it, y along the closing axis.
         pinch: The grip.
-        intervals: N of the grid.
-        safety: ≥ 1; covers the velocity terms, transients, and friction and mass that are not as assumed.
+        velocity: (N+1, n) q̇ expected at each grid point (rad/s).
+        safety: ≥ 1; covers other velocities, transients, and friction and mass that are not as assumed.
         closing_share: Part of N that acceleration may add to or take from one pad, in (0, 1).
     """
     if safety < 1 or not 0 < closing_share < 1:
         raise InvalidProblem(f"safety must be ≥ 1 and the closing share in (0, 1); got {safety}, {closing_share}")
     grip = [pinch.force, pinch.sliding, pinch.torsional, pinch.width, safety]
     numbers = np.concatenate([symbolic.payload_vector(part), _frame(T_flange_grasp), grip])
+    velocity = np.asarray(velocity, dtype=float)
 
     def build() -> ca.Function:
-        q, v, p = _inputs(robot, 27)
-        force, moment = symbolic.payload_wrench(robot)(q, v, p[:10])
+        q, v, p = _inputs(robot, 27 + robot.n)
+        force, moment = symbolic.payload_wrench(robot)(q, p[27:], v, p[:10])
         axes, origin, grip = _matrix(p[10:19]), p[19:22], p[22:27]
         moment -= ca.cross(origin, force)
         F, M = axes.T @ force, axes.T @ moment
@@ -167,7 +169,8 @@ def hold(
     function = _cached(robot, "hold", build)
     scale = _bound(1 / safety**2, 1 / safety**2, closing_share)
     lower, upper = _bound(-np.inf, -np.inf, -closing_share), _bound(0.0, 0.0, closing_share)
-    return NodeConstraint("hold", function, _at_each(numbers, intervals), lower, upper, scale)
+    parameters = np.hstack([_at_each(numbers, len(velocity) - 1), velocity])
+    return NodeConstraint("hold", function, parameters, lower, upper, scale)
 
 
 # The carried part is well above the ground after this part of the delivery, by LIFT_CLEARANCE (m): more than it sags in

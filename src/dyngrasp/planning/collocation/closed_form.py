@@ -144,6 +144,18 @@ def unconstrained_optimum(problem: PhaseProblem) -> Trajectory:
     return least_effort(problem, best_duration(problem))
 
 
+def within_speed_limits(problem: PhaseProblem, duration: float) -> Trajectory:
+    """The motion of least effort, slow enough to keep the speed limits at the grid points if it may be."""
+    for _ in range(3):
+        motion = least_effort(problem, duration)
+        ratio = float((np.abs(motion.velocity) / problem.velocity_limit).max())
+        if ratio <= 1.001:
+            return motion
+        # Exact from rest to rest; with moving ends the ratio falls more slowly than 1/T, hence the repetition.
+        duration = min(duration * ratio, problem.max_duration)
+    return least_effort(problem, duration)
+
+
 def optimum_through(
     problem: PhaseProblem, timetables: Sequence[Sequence[int]], waypoints: Array
 ) -> tuple[Trajectory, float]:

@@ -11,6 +11,7 @@ import pinocchio as pin
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.planning import constraints
 from dyngrasp.planning.audit import audit
+from dyngrasp.planning.collocation.closed_form import best_duration, within_speed_limits
 from dyngrasp.planning.collocation.descent import descent
 from dyngrasp.planning.collocation.gripper_path import GripperPath, gripper_path
 from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
@@ -43,8 +44,8 @@ class CollocationSettings:
         position_margin: Distance kept from the position limits (rad), less where a boundary state is closer.
         funnel_margin: h ≥ this at the grid points of the approach (m) at N = 100, because between them the hand cuts
             corners, by the square of the step on other grids; raised where the audit finds that it cuts deeper.
-        hold_safety: Factor by which the pinch exceeds what the part asks of it while it is carried; raised where the
-            audit finds that velocities add more than this covers.
+        hold_safety: Factor by which the pinch exceeds what the part asks of it while it is carried, at the velocities
+            of the motion of least effort; where the audit finds that the real ones ask too much, at those.
         max_duration: Longest approach and longest delivery (s).
     """
 
@@ -55,7 +56,7 @@ class CollocationSettings:
     torque_fraction: float = 0.9
     position_margin: float = 0.01
     funnel_margin: float = 0.002
-    hold_safety: float = 1.5
+    hold_safety: float = 1.4
     max_duration: float = 30.0
 
     def __post_init__(self) -> None:
@@ -72,33 +73,37 @@ BACKENDS = {"structured": lambda: StructuredSolver(StructuredSettings()), "ipopt
 
 @dataclass(frozen=True)
 class _Reserves:
-    """What rows keep in hand for what they leave out.
+    """What rows keep in hand for what they leave out, and the velocities that they are told.
 
     Attributes:
         funnel: Margin of h for the chords between the grid points (m).
-        hold: Factor on the pinch for what velocities add to the wrench of the part.
+        hold: Factor on the pinch.
+        carried: Motion whose velocities load the pinch; None for that of least effort.
     """
 
     funnel: float
     hold: float
+    carried: Trajectory | None = None
 
-    def raised(self, report: AuditReport) -> _Reserves | None:
-        """Larger by what the audit found missing; None if that is nothing, or more than reserves can help."""
+    def raised(self, report: AuditReport, carried: Trajectory) -> _Reserves | None:
+        """Larger by what the audit found missing; None if that is nothing, or more than reserves can help.
+
+        Args:
+            report: What the audit says of a plan.
+            carried: Its delivery.
+        """
         missing = {entry.name: entry.worst for entry in report.failures}
-        if not missing or not missing.keys() <= _PHASE_OF_RESERVE.keys():
-            return None
-        if self.funnel >= LARGEST_FUNNEL_MARGIN or self.hold >= LARGEST_HOLD_SAFETY:
+        if not missing or not missing.keys() <= _PHASE_OF_RESERVE.keys() or self.funnel >= LARGEST_FUNNEL_MARGIN:
             return None
         # A little more than was missing: the new motion differs from the one that was looked at.
-        return _Reserves(
-            self.funnel - 1.3 * missing.get("funnel", 0.0), self.hold * 1.02 * max(missing.get("hold", 0.0), 1 / 1.02)
-        )
+        raised = replace(self, funnel=self.funnel - 1.3 * missing.get("funnel", 0.0))
+        return replace(raised, hold=1.02 * self.hold, carried=carried) if "hold" in missing else raised
 
 
 _PHASE_OF_RESERVE = {"funnel": 0, "hold": 2}
 
-# Beyond this a part that stands still in the hand could hardly be held.
-LARGEST_HOLD_SAFETY = 3.0
+# Plans after which raising the reserves is given up.
+MOST_PLANS = 5
 
 # The pre-grasp itself stands 20 mm above the tip of the funnel (m).
 LARGEST_FUNNEL_MARGIN = 0.015
@@ -152,7 +157,10 @@ class CollocationPlanner:
                 timings["total"] = 1e3 * (time.perf_counter() - began)
                 return PlanResult(solution.status, None, tuple(solutions), None, timings, solution.message)
         plan, report = self._audited(solutions, paths, targets, start_time, timings)
-        while (raised := reserves.raised(report)) is not None:
+        for _ in range(1, MOST_PLANS):
+            raised = reserves.raised(report, solutions[-1].require())
+            if raised is None:
+                break
             reserves, problems = raised, self._problems(start, targets, paths, raised)
             again = {}
             for phase in (_PHASE_OF_RESERVE[entry.name] for entry in report.failures):
@@ -224,13 +232,11 @@ class CollocationPlanner:
             max(bounds[1], task.settings.grasp_duration_min),
             longest,
         )
-        carry = (
-            constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction),
-            self._hold(targets, reserves.hold),
-            self._above_ground(targets),
-        )
-        deliver = self._phase("deliver", targets.grasped, targets.place, carry, 0.0, settings.max_duration)
-        return approach, grasp, deliver
+        torque = constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction)
+        deliver = self._phase("deliver", targets.grasped, targets.place, (torque,), 0.0, settings.max_duration)
+        carried = reserves.carried or within_speed_limits(deliver, best_duration(deliver))
+        hold = self._hold(targets, carried.velocity, reserves.hold)
+        return approach, grasp, replace(deliver, constraints=(torque, hold, self._above_ground(targets)))
 
     def guess(self, problem: PhaseProblem, targets: GraspTargets) -> Trajectory | None:
         """A start for the approach that comes down the funnel; None where the solver's own start is as good."""
@@ -307,14 +313,14 @@ class CollocationPlanner:
             settings.tilt_tolerance,
         )
 
-    def _hold(self, targets: GraspTargets, safety: float) -> NodeConstraint:
+    def _hold(self, targets: GraspTargets, velocity: Array, safety: float) -> NodeConstraint:
         task = self.task
         return constraints.hold(
             task.robot,
             self._T_flange_object(targets).act(task.grasp_object.spatial_inertia),
             task.T_flange_closed(targets.grasp),
             task.pinch(targets.grasp),
-            self.settings.intervals,
+            velocity,
             safety,
         )
 

@@ -125,7 +125,7 @@ class StructuredSolver:
             message = f"{problem.name}: optimal in closed form"
             return Solution(Status.CONVERGED, optimum, objective, 0, violation, timings, message)
 
-        start = _stretched(problem, T) if guess is None else on_grid(problem, guess)
+        start = closed_form.within_speed_limits(problem, T) if guess is None else on_grid(problem, guess)
         known = self._multipliers(guess, problem.intervals, limits.rows_per_point)
         barrier = settings.initial_barrier if guess is None else settings.guess_barrier
         deadline = began + settings.time_limit
@@ -195,18 +195,6 @@ def _refused(
 ) -> Solution:
     timings = {"total": 1e3 * (time.perf_counter() - began)}
     return Solution(status, None, np.nan, iterations, np.inf, timings, f"{problem.name}: {why}")
-
-
-def _stretched(problem: PhaseProblem, T: float) -> Trajectory:
-    """The motion of least effort, slow enough to keep the speed limits at the grid points if it may be."""
-    for _ in range(3):
-        motion = closed_form.least_effort(problem, T)
-        ratio = float((np.abs(motion.velocity) / problem.velocity_limit).max())
-        if ratio <= 1.001:
-            break
-        # Exact from rest to rest; with moving ends the ratio falls more slowly than 1/T, hence the repetition.
-        T = min(T * ratio, problem.max_duration)
-    return closed_form.least_effort(problem, T)
 
 
 def on_grid(problem: PhaseProblem, guess: Trajectory) -> Trajectory:
