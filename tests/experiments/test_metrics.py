@@ -88,6 +88,7 @@ def perfect(task, plan):
         gripper_torque_applied=zero,
         part_position=np.array([T.translation for T in parts]),
         part_quat_wxyz=quats(parts),
+        support_position=np.zeros((len(t), 3)),
         hand_position=np.array([T.translation for T in hands]),
         hand_quat_wxyz=quats(hands),
         grasp_point=np.array([T.act(T_hand_grasp.translation) for T in hands]),

@@ -212,3 +212,15 @@ def test_functions_are_built_once_for_all_payloads_and_poses(iiwa, sdh2, T_flang
 def test_senseless_hold_is_refused(iiwa, T_flange_grasp, bad):
     with pytest.raises(InvalidProblem, match="safety"):
         constraints.hold(iiwa, PART, T_flange_grasp, PINCH, np.zeros((N + 1, 7)), **bad)
+
+
+def test_a_frame_for_each_grid_point_is_that_of_a_part_that_moves(iiwa):
+    points = np.tile([0.0, 0.0, 0.3], (5, 1))
+    frames = [pin.SE3(pin.utils.rotate("z", 0.1 * k), np.array([0.6, 0.01 * k, 0.2])) for k in range(5)]
+    moving = constraints.funnel(iiwa, points, frames, FUNNEL)
+    for k, frame in enumerate(frames):
+        np.testing.assert_array_equal(
+            moving.parameters[k], constraints.funnel(iiwa, points, frame, FUNNEL).parameters[k]
+        )
+    with pytest.raises(InvalidProblem):
+        constraints.grasp_tube(iiwa, points, np.eye(3), frames[:4])

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from dyngrasp.perception.pose_noise import PoseNoise
-from dyngrasp.signals import Array, PoseEstimate
+from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.plant import Truth
 
 
@@ -28,7 +28,8 @@ class TruePoses:
 
     def estimate(self, truth: Truth, t: float) -> PoseEstimate:
         """The truth."""
-        return PoseEstimate(truth.T_world_part, 1e-12 * np.eye(6), t, t, _twist(truth, self._track_motion))
+        twist = truth.part_twist if self._track_motion else np.zeros(6)
+        return PoseEstimate(truth.T_world_part, 1e-12 * np.eye(6), t, t, twist)
 
 
 class NoisyPoses:
@@ -40,9 +41,5 @@ class NoisyPoses:
 
     def estimate(self, truth: Truth, t: float) -> PoseEstimate:
         """The truth with the error of this distance."""
-        twist = _twist(truth, self._track_motion)
+        twist = truth.part_twist if self._track_motion else None
         return self._noise.estimate(truth.T_world_part, truth.p_world_grasp_point, t, twist)
-
-
-def _twist(truth: Truth, track_motion: bool) -> Array:
-    return truth.part_twist if track_motion else np.zeros(6)

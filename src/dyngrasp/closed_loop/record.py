@@ -40,6 +40,7 @@ class EpisodeRecord:
         gripper_planned, gripper_measured: (K, m) positions.
         gripper_torque_commanded, gripper_torque_applied: (K, m).
         part_position, part_quat_wxyz: (K, 3), (K, 4) true pose of the object frame.
+        support_position: (K, 3) how far what the part stood on at first has moved.
         hand_position, hand_quat_wxyz: (K, 3), (K, 4) true pose of the hand frame.
         grasp_point: (K, 3) true midpoint of the two pads, world frame.
         pad_force: (K, pads) normal force between each pad and the part (N).
@@ -65,6 +66,7 @@ class EpisodeRecord:
     gripper_torque_applied: Array
     part_position: Array
     part_quat_wxyz: Array
+    support_position: Array
     hand_position: Array
     hand_quat_wxyz: Array
     grasp_point: Array
@@ -184,6 +186,7 @@ class Recorder:
                 applied.gripper_torque,
                 part.translation.copy(),
                 _quat_wxyz(part),
+                truth.p_world_support,
                 hand.translation.copy(),
                 _quat_wxyz(hand),
                 truth.p_world_grasp_point,

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.experiments.scenario import PlantSection, PoseSection
+from dyngrasp.experiments.scenario import ConveyorSection, PlantSection, PoseSection
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.models.grasp_object import GraspObject
+from dyngrasp.signals import Array
+from dyngrasp.simulation.conveyor import Conveyor, standing_on
 from dyngrasp.simulation.variation import PlantVariation
 
 
@@ -27,12 +29,23 @@ class Trial:
         T_world_object: Where the part is.
         T_world_object_believed: Where the planner is told that it is.
         variation: What the planner does not know about the plant.
+        twist_world: (6,) velocity of the part (m/s, rad/s), world axes.
+        twist_believed: (6,) what the planner is told of it.
     """
 
     seed: int
     T_world_object: pin.SE3
     T_world_object_believed: pin.SE3
     variation: PlantVariation
+    twist_world: Array
+    twist_believed: Array
+
+    @property
+    def conveyor(self) -> Conveyor | None:
+        """What the part stands on, if it moves."""
+        if not self.twist_world.any():
+            return None
+        return Conveyor(self.twist_world[:2], self.T_world_object.translation[:2])
 
 
 def trial_seed(study_seed: int, index: int) -> int:
@@ -44,18 +57,34 @@ def trial_seed(study_seed: int, index: int) -> int:
 def draw_trial(workcell: Workcell, seed: int) -> Trial:
     """Draw the trial that belongs to a seed."""
     scenario, grasp_object = workcell.scenario, workcell.task.grasp_object
-    part_rng, pose_rng, plant_rng = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
+    part_rng, pose_rng, plant_rng, conveyor_rng = streams
     part = scenario.part
     x, y = part_rng.uniform(*part.x_m), part_rng.uniform(*part.y_m)
     yaw = np.deg2rad(part_rng.uniform(*part.yaw_deg))
     z = part_rng.uniform(*part.z_m) if part.z_m is not None else grasp_object.rest_height
     T_world_object = pin.SE3(pin.utils.rotate("z", yaw), np.array([x, y, z]))
+    twist, twist_believed = _twists(scenario.conveyor, conveyor_rng)
+    if twist.any():
+        T_world_object = standing_on(Conveyor(twist[:2], np.zeros(2)), T_world_object)
     return Trial(
         seed=seed,
         T_world_object=T_world_object,
         T_world_object_believed=_believed(T_world_object, grasp_object, scenario.pose, pose_rng),
         variation=_variation(scenario.plant, workcell.task.robot.n, plant_rng),
+        twist_world=twist,
+        twist_believed=twist_believed,
     )
+
+
+def _twists(section: ConveyorSection | None, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Velocity of the part, true and believed, each (6,)."""
+    true = np.zeros(6)
+    if section is None:
+        return true, true
+    speed, heading = rng.uniform(*section.speed_m_s), np.deg2rad(rng.uniform(*section.heading_deg))
+    true[:2] = speed * np.array([np.cos(heading), np.sin(heading)])
+    return true, (1.0 + section.speed_error * rng.uniform(-1.0, 1.0)) * true
 
 
 def _believed(T_world_object: pin.SE3, part: GraspObject, pose: PoseSection, rng: np.random.Generator) -> pin.SE3:

@@ -151,10 +151,11 @@ def _undisturbed(
     end = int(closed.argmax()) if closed.any() else record.index_at(plan.phase_ends[1])
     # Two points far apart: a push turns the part as well as it moves it, and one point may be where it turns about.
     points = np.array([grasp.T_object_grasp.translation, task.grasp_object.spatial_inertia.lever])
-    before = record.T_world_part(0)
-    distance = 1e3 * np.array(
-        [max(np.linalg.norm(record.T_world_part(k).act(p) - before.act(p)) for p in points) for k in range(end + 1)]
-    )
+    before = np.array([record.T_world_part(0).act(p) for p in points])
+    # A conveyor carries the part along: only what it moves relative to that is the hand's doing.
+    carried = record.support_position - record.support_position[0]
+    now = np.array([[record.T_world_part(k).act(p) for p in points] for k in range(end + 1)])
+    distance = 1e3 * np.linalg.norm(now - before - carried[: end + 1, None], axis=2).max(axis=1)
     moved, too_far = float(distance.max()), distance >= limits.disturbance_mm
     return Criterion(
         "undisturbed",

@@ -80,9 +80,12 @@ def pose_source(section: PoseSection, trial: Trial, grasp: Grasp) -> PoseSource:
         residual_angle=np.deg2rad(section.residual_deg),
         frame_position=1e-3 * section.frame_mm,
         frame_angle=np.deg2rad(section.frame_deg),
+        frame_velocity=1e-3 * section.frame_mm_s,
+        frame_spin=np.deg2rad(section.frame_deg_s),
     )
     seed = int(np.random.SeedSequence(trial.seed, spawn_key=(_POSE_STREAM,)).generate_state(1, np.uint64)[0])
-    return NoisyPoses(PoseNoise(error, T_object_grasp, settings, seed), moving)
+    twist_error = trial.twist_believed - trial.twist_world
+    return NoisyPoses(PoseNoise(error, T_object_grasp, settings, seed, twist_error), moving)
 
 
 def replanning_summary(events: Sequence[ReplanEvent], not_taken: Sequence[float] = ()) -> dict[str, Any]:

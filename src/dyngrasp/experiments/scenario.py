@@ -16,6 +16,7 @@ from dyngrasp.planning.grasp_targets import TaskSettings
 
 __all__ = [
     "CameraSection",
+    "ConveyorSection",
     "Range",
     "Scenario",
     "PartSection",
@@ -122,6 +123,19 @@ class PartSection(StrictSchema):
     z_m: Coordinate | None = None
 
 
+class ConveyorSection(StrictSchema):
+    """`[conveyor]`: the part stands on a plate that slides in the ground and carries it; `[part]` is where it starts.
+
+    The planner is told the speed and heading with which the part starts, the speed off by up to `speed_error`, a
+    fraction; how much of that is revealed on the way, `[pose]` says as for the pose. `heading_deg` counts from the
+    world's x axis to its y axis.
+    """
+
+    speed_m_s: PositiveRange
+    heading_deg: Range = (90.0, 90.0)
+    speed_error: Spread = 0.0
+
+
 class PlannerSection(StrictSchema):
     """`[planner]`: `effort_weight` is ρ of eq. (3a) in s⁴/rad² (the paper: 1), `intervals` is N."""
 
@@ -145,6 +159,7 @@ class PoseSection(StrictSchema):
     """
 
     source: Literal["truth", "noise", "camera"] = "truth"
+    motion: Literal["still", "constant_velocity"] = "still"
     position_mm: NonNegative = 0.0
     rotation_deg: NonNegative = 0.0
     along_mm: Finite = 0.0
@@ -158,8 +173,9 @@ class PoseSection(StrictSchema):
     residual_deg: NonNegative = 0.5
     frame_mm: NonNegative = 0.2
     frame_deg: NonNegative = 0.05
+    frame_mm_s: NonNegative = 1.0
+    frame_deg_s: NonNegative = 0.1
 
-    motion: Literal["still", "constant_velocity"] = "still"
     @model_validator(mode="after")
     def _truth_is_exact(self) -> Self:
         if self.source == "truth" and any(
@@ -191,6 +207,8 @@ class CameraSection(StrictSchema):
     mount_deg: NonNegative = 0.0
     prior_mm: Annotated[float, Field(gt=0.0)] = 30.0
     prior_deg: Annotated[float, Field(gt=0.0)] = 10.0
+    largest_deviation_mm: Annotated[float, Field(gt=0.0)] = 5.0
+    keep_every: Annotated[int, Field(ge=0)] = 3
 
     @model_validator(mode="after")
     def _both_sides(self) -> Self:
@@ -207,8 +225,6 @@ class ReplannerSection(StrictSchema):
     """
 
     enabled: bool = False
-    largest_deviation_mm: Annotated[float, Field(gt=0.0)] = 5.0
-    keep_every: Annotated[int, Field(ge=0)] = 3
     rate_hz: Annotated[float, Field(gt=0.0, le=100.0)] = 10.0
     budget_ms: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
     latency_ms: NonNegative | Literal["measured"] = 20.0
@@ -247,6 +263,7 @@ class Scenario(StrictSchema):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     task: TaskSection
     part: PartSection
+    conveyor: ConveyorSection | None = None
     planner: PlannerSection = PlannerSection()
     pose: PoseSection = PoseSection()
     camera: CameraSection = CameraSection()

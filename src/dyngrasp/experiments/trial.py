@@ -23,8 +23,9 @@ from dyngrasp.experiments.vision import camera_poses, films, vision_summary
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.perception.part_tracker import FrameReport
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
-from dyngrasp.planning.grasp_targets import GraspTargets, ranked_grasp_targets
+from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved, ranked_grasp_targets
 from dyngrasp.planning.problem import PlanResult
+from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
 from dyngrasp.simulation.plant import TruthfulPlant
 from dyngrasp.simulation.scene import Scene, SceneSettings, build_scene
@@ -32,6 +33,9 @@ from dyngrasp.trajectory import GraspPlan
 
 # Arm postures that are tried, best first, before a pose counts as not plannable.
 CANDIDATES = 4
+
+# When a moving part is met, over the time of the grasp of one that stands where it will be met; tried in turn.
+LATER = (1.0, 1.1, 1.25)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +58,11 @@ class ExecutedTrial:
     plan: GraspPlan
     targets: GraspTargets
     replans: tuple[ReplanEvent, ...] = ()
+    not_taken: tuple[float, ...] = ()
     frames: tuple[FrameReport, ...] = ()
 
 
 def planner_for(workcell: Workcell) -> CollocationPlanner:
-    not_taken: tuple[float, ...] = ()
     """The planner that a scenario asks for; it keeps its compiled functions, so make one a process."""
     section = workcell.scenario.planner
     settings = CollocationSettings(
@@ -77,16 +81,42 @@ def plan_trial(workcell: Workcell, trial: Trial, planner: CollocationPlanner) ->
     began = time.perf_counter()
     first: tuple[GraspTargets, PlanResult] | None = None
     attempts = 0
-    candidates = ranked_grasp_targets(trial.T_world_object_believed, workcell.task, workcell.q_start)
-    for targets in islice(candidates, CANDIDATES):
+    T, twist = trial.T_world_object_believed, trial.twist_believed
+    if twist.any():
+        # When the part is met depends on where, and where on when: this is a first guess.
+        targets = grasp_targets(T, workcell.task, workcell.q_start)
+        first_guess = planner.plan(workcell.q_start, targets)
+        if first_guess.plan is None:
+            return PlannedTrial(targets, first_guess, 1e3 * (time.perf_counter() - began), 1)
+        T = moved(T, twist, float(first_guess.plan.phase_ends[1]))
+    for targets in islice(ranked_grasp_targets(T, workcell.task, workcell.q_start), CANDIDATES):
         attempts += 1
         result = planner.plan(workcell.q_start, targets)
+        if result.plan is not None and twist.any():
+            targets, result = _met(workcell, trial, planner, targets, result.plan)
         if result.ok:
             return PlannedTrial(targets, result, 1e3 * (time.perf_counter() - began), attempts)
         # Of several failures the best posture's says most.
         first = first or (targets, result)
     assert first is not None  # ranked_grasp_targets yields at least once or raises
     return PlannedTrial(*first, 1e3 * (time.perf_counter() - began), attempts)
+
+
+def _met(
+    workcell: Workcell, trial: Trial, planner: CollocationPlanner, standing: GraspTargets, plan: GraspPlan
+) -> tuple[GraspTargets, PlanResult]:
+    """Targets and plan that meet a moving part, from a plan for one that stands about where it will be met."""
+    updater, duration = target_updater(workcell.task), float(plan.durations[1])
+    result = None
+    for later in LATER:
+        grasp_time = later * float(plan.phase_ends[1])
+        T = moved(trial.T_world_object_believed, trial.twist_believed, grasp_time)
+        targets = updater.update(standing, T, trial.twist_believed, grasp_time, duration)
+        result = planner.plan(workcell.q_start, targets)
+        if result.ok:
+            break
+    assert result is not None
+    return targets, result
 
 
 def execute_trial(
@@ -108,7 +138,15 @@ def execute_trial(
     task, plan = workcell.task, planned.result.require()
     period = 1.0 / workcell.scenario.plant.control_rate_hz
     settings = SceneSettings(timestep=min(SceneSettings().timestep, period))
-    scene = build_scene(task.robot, task.gripper, task.grasp_object, trial.variation, settings, markers=films(workcell))
+    scene = build_scene(
+        task.robot,
+        task.gripper,
+        task.grasp_object,
+        trial.variation,
+        settings,
+        markers=films(workcell),
+        conveyor=trial.conveyor,
+    )
     plant: TruthfulPlant = MujocoPlant(
         scene, plan.arm[0].position[0], plan.gripper[0].position[0], trial.T_world_object, t=plan.start_time
     )

@@ -24,6 +24,7 @@ class PoseNoiseSettings:
         reveal_to: Distance below which all of it is (m).
         residual_position, residual_angle: Radius (m) and largest angle (rad) of the error that stays, drawn once.
         frame_position, frame_angle: Standard deviation of each axis from frame to frame (m, rad).
+        frame_velocity, frame_spin: The same of the velocities of a moving part (m/s, rad/s).
     """
 
     reveal_from: float = 0.40
@@ -32,11 +33,16 @@ class PoseNoiseSettings:
     residual_angle: float = np.deg2rad(0.5)
     frame_position: float = 0.0002
     frame_angle: float = np.deg2rad(0.05)
+    frame_velocity: float = 0.001
+    frame_spin: float = np.deg2rad(0.1)
 
     def __post_init__(self) -> None:
         if not 0 <= self.reveal_to < self.reveal_from:
             raise InvalidProblem(f"0 ≤ reveal_to < reveal_from expected, got {self.reveal_to}, {self.reveal_from} m")
-        numbers = (self.residual_position, self.residual_angle, self.frame_position, self.frame_angle)
+        numbers = (
+            *(self.residual_position, self.residual_angle, self.frame_position, self.frame_angle),
+            *(self.frame_velocity, self.frame_spin),
+        )
         if not (np.isfinite(numbers).all() and min(numbers) >= 0):
             raise InvalidProblem(f"errors of a pose must be ≥ 0, got {numbers}")
 
@@ -47,7 +53,14 @@ class PoseNoise:
     Errors act in the grasp frame: there a turn does not move the place where the fingers go.
     """
 
-    def __init__(self, first_error: pin.SE3, T_object_grasp: pin.SE3, settings: PoseNoiseSettings, seed: int) -> None:
+    def __init__(
+        self,
+        first_error: pin.SE3,
+        T_object_grasp: pin.SE3,
+        settings: PoseNoiseSettings,
+        seed: int,
+        first_twist_error: Array | None = None,
+    ) -> None:
         """Draw the error that stays.
 
         Args:
@@ -55,7 +68,9 @@ class PoseNoise:
             T_object_grasp: The grasp frame in the object.
             settings: Distances and sizes.
             seed: Of all draws.
+            first_twist_error: (6,) what is believed of a moving part's velocities at first, less the truth.
         """
+        self._first_twist = np.zeros(6) if first_twist_error is None else first_twist_error
         self._first = pin.log6(first_error).vector
         self._T_object_grasp = T_object_grasp
         self.settings = settings
@@ -79,7 +94,7 @@ class PoseNoise:
             T_world_object: The truth.
             p_world_hand: (3,) G of the hand (m).
             t: When the picture is taken (s).
-            twist_world: (6,) velocities of the part as they are estimated; at rest if left out.
+            twist_world: (6,) true velocities of the part; at rest, and known to be, if left out.
         """
         s = self.settings
         T_world_grasp = T_world_object * self._T_object_grasp
@@ -92,7 +107,11 @@ class PoseNoise:
         # A covariance without uncertainty would be none that a filter could use.
         covariance = np.diag(np.maximum(variance, 1e-12))
         T = T_world_grasp * pin.exp6(error) * self._T_object_grasp.inverse()
-        return PoseEstimate(T, covariance, t, t, np.zeros(6) if twist_world is None else twist_world)
+        twist = np.zeros(6)
+        if twist_world is not None:
+            noise = np.repeat([s.frame_velocity, s.frame_spin], 3) * self._rng.normal(size=6)
+            twist = twist_world + share * self._first_twist + noise
+        return PoseEstimate(T, covariance, t, t, twist)
 
 
 def _direction(rng: np.random.Generator) -> Array:

@@ -7,7 +7,7 @@ share.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -49,7 +49,11 @@ def torque_rows(robot: RobotModel, intervals: int, fraction: float = 1.0) -> Nod
 
 
 def funnel(
-    robot: RobotModel, p_flange_grasp: ArrayLike, T_world_grasp: pin.SE3, shape: Funnel, margin: float = 0.0
+    robot: RobotModel,
+    p_flange_grasp: ArrayLike,
+    T_world_grasp: pin.SE3 | Sequence[pin.SE3],
+    shape: Funnel,
+    margin: float = 0.0,
 ) -> NodeConstraint:
     """G stays above the inverted Gaussian, eqs. (5) and (6): h = z − z_th (1 − exp(−½ (x²/σx² + y²/σy²))) ≥ 0.
 
@@ -60,13 +64,13 @@ def funnel(
     Args:
         robot: The arm.
         p_flange_grasp: (N+1, 3) G in the flange frame at each grid point (m).
-        T_world_grasp: The grasp frame, z outward along the approach axis.
+        T_world_grasp: The grasp frame, z outward along the approach axis; one for each grid point if the part moves.
         shape: z_th, σx, σy (m).
         margin: h ≥ margin at the grid points (m), for what happens between them.
     """
     points = _points(p_flange_grasp)
-    frame = np.concatenate([_frame(T_world_grasp), [shape.z_threshold, shape.sigma_x, shape.sigma_y]])
-    parameters = np.hstack([points, np.tile(frame, (len(points), 1))])
+    widths = np.array([shape.z_threshold, shape.sigma_x, shape.sigma_y])
+    parameters = np.hstack([points, _frames(T_world_grasp, len(points)), _at_each(widths, len(points) - 1)])
 
     def build() -> ca.Function:
         q, v, p = _inputs(robot, 18)
@@ -83,7 +87,7 @@ def grasp_tube(
     robot: RobotModel,
     p_flange_grasp: ArrayLike,
     R_flange_grasp: ArrayLike,
-    T_world_grasp: pin.SE3,
+    T_world_grasp: pin.SE3 | Sequence[pin.SE3],
     lateral: float = 0.0015,
     dip: float = 0.003,
     tilt: float = np.deg2rad(1.0),
@@ -97,14 +101,14 @@ def grasp_tube(
         robot: The arm.
         p_flange_grasp: (N+1, 3) G in the flange frame (m): it moves as the fingers close.
         R_flange_grasp: (3, 3) axes of the hand's grasp frame in the flange frame.
-        T_world_grasp: The grasp frame.
+        T_world_grasp: The grasp frame; one for each grid point if the part moves.
         lateral: How far G may leave the grasp axis (m), > 0.
         dip: How far G may pass below the grasp frame (m), > 0.
         tilt: How far the hand may turn against the grasp frame (rad), > 0.
     """
     points = _points(p_flange_grasp)
-    fixed = np.concatenate([np.asarray(R_flange_grasp, dtype=float).ravel(), _frame(T_world_grasp)])
-    parameters = np.hstack([points, np.tile(fixed, (len(points), 1))])
+    axes = np.asarray(R_flange_grasp, dtype=float).ravel()
+    parameters = np.hstack([points, _at_each(axes, len(points) - 1), _frames(T_world_grasp, len(points))])
 
     def build() -> ca.Function:
         q, v, p = _inputs(robot, 24)
@@ -253,6 +257,15 @@ def _matrix(row_major: ca.SX) -> ca.SX:
 
 def _frame(T: pin.SE3) -> Array:
     return np.concatenate([T.rotation.ravel(), T.translation])
+
+
+def _frames(T: pin.SE3 | Sequence[pin.SE3], count: int) -> Array:
+    """(count, 12) numbers of one frame, or of as many."""
+    if isinstance(T, pin.SE3):
+        return _at_each(_frame(T), count - 1)
+    if len(T) != count:
+        raise InvalidProblem(f"one frame for each of the {count} grid points expected, got {len(T)}")
+    return np.stack([_frame(each) for each in T])
 
 
 def _points(p_flange_grasp: ArrayLike) -> Array:

@@ -174,6 +174,7 @@ class GraspTargets:
         place: End of the delivery: the target configuration, at rest.
         gripper_open, gripper_closed: (m,) gripper postures before and after the grasp (rad).
         grasp_time: When a moving part is at `T_world_object`: at the grasp (s). Without meaning for a part at rest.
+        grasp_duration: How long before that the hand is at the pre-grasp (s), for a moving part.
         twist_world: (6,) velocity of the object frame's origin (m/s) and angular velocity (rad/s) of the part, in world
             axes.
     """
@@ -186,6 +187,7 @@ class GraspTargets:
     gripper_open: Array
     gripper_closed: Array
     grasp_time: float = 0.0
+    grasp_duration: float = 0.0
     twist_world: Array = field(default_factory=lambda: np.zeros(6))
 
     def __post_init__(self) -> None:

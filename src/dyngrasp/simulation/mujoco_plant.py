@@ -67,7 +67,7 @@ class MujocoPlant:
         scene: The compiled world; several plants may share it, each has a state of its own.
         arm_position: (n,) where the arm starts, at rest (rad).
         gripper_position: (m,) where the planned gripper joints start, at rest (rad).
-        T_world_part: Where the part lies, at rest.
+        T_world_part: Where the part lies, at rest on what it stands on.
         sensors: Imperfections of the sensors.
         t: Time at the start (s).
     """
@@ -94,8 +94,13 @@ class MujocoPlant:
         x, y, z, w = pin.Quaternion(T_world_part.rotation).coeffs()
         data.qpos[scene.part_qpos : scene.part_qpos + 7] = [*T_world_part.translation, w, x, y, z]
         n, m = scene.arm_qpos.size, scene.gripper_qpos.size
-        self._arm, self._gripper, self._locked = slice(0, n), slice(n, n + m), slice(n + m, None)
+        locked = n + m + scene.locked_qpos.size
+        self._arm, self._gripper, self._locked = slice(0, n), slice(n, n + m), slice(n + m, locked)
         data.ctrl[self._locked] = scene.locked_position
+        if scene.conveyor is not None:
+            # It runs before the episode begins, and the part with it.
+            data.ctrl[scene.conveyor.actuator] = data.qvel[scene.conveyor.dof] = scene.conveyor.speed
+            data.qvel[scene.part_dof : scene.part_dof + 3] = scene.conveyor.speed * scene.conveyor.direction
         mujoco.mj_forward(scene.model, data)
         self._observed_at = -1.0
         self._observation: Observation | None = None
@@ -155,12 +160,16 @@ class MujocoPlant:
         hand = scene.hand_body
         T_world_hand = pin.SE3(data.xmat[hand].reshape(3, 3).copy(), data.xpos[hand].copy())
         kinds = scene.geom_kind[data.contact.geom]
+        support = np.zeros(3)
+        if scene.conveyor is not None:
+            support = data.qpos[scene.conveyor.qpos] * scene.conveyor.direction
         present = set(_CATEGORY_TABLE[kinds[:, 0], kinds[:, 1]].tolist())
         return Truth(
             t=self.t,
             T_world_part=T_world_part,
             # MuJoCo gives the angular velocity of a free joint in body axes.
             part_twist=np.concatenate([v[:3], R_world_part @ v[3:]]),
+            p_world_support=support,
             T_world_hand=T_world_hand,
             p_world_grasp_point=data.site_xpos[scene.pad_sites].mean(axis=0),
             arm_position=data.qpos[scene.arm_qpos],

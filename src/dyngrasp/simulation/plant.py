@@ -52,6 +52,7 @@ class Truth:
         t: Time (s).
         T_world_part: Pose of the part's object frame.
         part_twist: (6,), linear velocity of the object frame's origin (m/s) and angular velocity (rad/s), world axes.
+        p_world_support: (3,) how far what the part stood on at first has moved (m); zero for the ground.
         T_world_hand: Pose of the hand frame.
         p_world_grasp_point: (3,), midpoint of the two pad frames (m): the grasp point G as the fingers stand.
         arm_position, arm_velocity: (n,) true joint states (rad, rad/s).
@@ -63,6 +64,7 @@ class Truth:
     t: float
     T_world_part: pin.SE3
     part_twist: Array
+    p_world_support: Array
     T_world_hand: pin.SE3
     p_world_grasp_point: Array
     arm_position: Array
@@ -74,7 +76,8 @@ class Truth:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "part_twist", read_only(self.part_twist, (6,)))
-        object.__setattr__(self, "p_world_grasp_point", read_only(self.p_world_grasp_point, (3,)))
+        for name in ("p_world_support", "p_world_grasp_point"):
+            object.__setattr__(self, name, read_only(getattr(self, name), (3,)))
         for name in ("arm_position", "arm_velocity", "gripper_position", "gripper_velocity", "pad_force"):
             object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
 

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from dyngrasp.simulation.conveyor import CONVEYOR, Conveyor, ConveyorAddresses, add_conveyor, locate_conveyor
 from dyngrasp.simulation.variation import PlantVariation
 
 if TYPE_CHECKING:
@@ -63,7 +64,8 @@ class Scene:
         hand_body: Body whose frame is the hand frame.
         pad_geoms: (pads,) geoms that are meant to touch the part.
         pad_sites: (pads,) the gripper's pad frames.
-        geom_kind: (ngeom,) 0 ground, 1 part, 2 pad, 3 the rest of the robot.
+        geom_kind: (ngeom,) 0 ground and what stands for it, 1 part, 2 pad, 3 the rest of the robot.
+        conveyor: What carries the part, if anything does.
     """
 
     model: MjModel
@@ -83,6 +85,7 @@ class Scene:
     pad_geoms: IntArray
     pad_sites: IntArray
     geom_kind: IntArray
+    conveyor: ConveyorAddresses | None = None
 
 
 def build_scene(
@@ -93,6 +96,7 @@ def build_scene(
     settings: SceneSettings | None = None,
     *,
     markers: bool = False,
+    conveyor: Conveyor | None = None,
 ) -> Scene:
     """Compose and compile the world.
 
@@ -106,6 +110,7 @@ def build_scene(
             friction if None.
         settings: Numerics.
         markers: Stick the part's markers on its faces, for cameras and pictures; they weigh and touch nothing.
+        conveyor: What the part stands on, if not on the ground.
 
     Raises:
         ValueError: The variation is for another number of joints.
@@ -128,8 +133,10 @@ def build_scene(
 
         add_stickers(spec, spec.body(PART), grasp_object)
     _add_motors(spec, robot, gripper, settings)
+    if conveyor is not None:
+        add_conveyor(spec, conveyor, settings)
     _set_contacts(spec, gripper, variation, settings)
-    return _locate(spec.compile(), settings, robot, gripper)
+    return _locate(spec.compile(), settings, robot, gripper, conveyor)
 
 
 def nominal_variation(robot: RobotModel, grasp_object: GraspObject) -> PlantVariation:
@@ -282,7 +289,7 @@ def _set_contacts(spec: MjSpec, gripper: GripperModel, variation: PlantVariation
             geom.priority = 1
             geom.condim = 4
             geom.friction = [variation.friction, variation.torsional_friction, 1e-4]
-        elif geom.name != GROUND:
+        elif geom.name not in (GROUND, CONVEYOR):
             geom.condim = 3
             geom.friction = [settings.ground_friction, 0.005, 1e-4]
     _exclude_neighbours(spec)
@@ -300,7 +307,9 @@ def _exclude_neighbours(spec: MjSpec) -> None:
             spec.add_exclude(bodyname1=name, bodyname2=grandparent)
 
 
-def _locate(model: MjModel, settings: SceneSettings, robot: RobotModel, gripper: GripperModel) -> Scene:
+def _locate(
+    model: MjModel, settings: SceneSettings, robot: RobotModel, gripper: GripperModel, conveyor: Conveyor | None
+) -> Scene:
     def addresses(names: list[str]) -> tuple[IntArray, IntArray]:
         ids = [model.joint(name).id for name in names]
         return model.jnt_qposadr[ids].astype(int), model.jnt_dofadr[ids].astype(int)
@@ -313,6 +322,8 @@ def _locate(model: MjModel, settings: SceneSettings, robot: RobotModel, gripper:
     kind = np.full(model.ngeom, 3)
     kind[model.geom_bodyid == part_body] = 1
     kind[model.geom(GROUND).id] = 0
+    if conveyor is not None:
+        kind[model.geom_bodyid == model.body(CONVEYOR).id] = 0
     kind[pad_geoms] = 2
     return Scene(
         model=model,
@@ -332,6 +343,7 @@ def _locate(model: MjModel, settings: SceneSettings, robot: RobotModel, gripper:
         pad_geoms=pad_geoms,
         pad_sites=np.array([model.site(HAND + name).id for name in gripper.pads]),
         geom_kind=kind,
+        conveyor=None if conveyor is None else locate_conveyor(model, conveyor),
     )
 
 

@@ -42,12 +42,25 @@ def descent(problem: PhaseProblem, targets: GraspTargets, task: GraspTask) -> Tr
     timetables = _timetables(problem.intervals)
     if top <= lowest or not timetables:
         return None
-    waypoints, q = [], problem.end_position
-    for height in lowest + (top - lowest) * np.array(HEIGHTS[::-1]):
-        above = targets.T_world_grasp * pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
-        q = _moved_to(task.robot, above * task.T_flange_open.inverse(), q)
-        waypoints.insert(0, q)
-    return optimum_through(problem, timetables, np.array(waypoints))[0]
+    heights = lowest + (top - lowest) * np.array(HEIGHTS)
+
+    def waypoints(before: Array) -> Array:
+        """(W, n) postures above the part, where it is so long before the pre-grasp (s)."""
+        found, q, end = [], problem.end_position, targets.grasp_time - targets.grasp_duration
+        for height, dt in zip(heights[::-1], before[::-1], strict=True):
+            T_world_grasp = targets.T_world_object_at(end - dt) * targets.grasp.T_object_grasp
+            above = T_world_grasp * pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
+            q = _moved_to(task.robot, above * task.T_flange_open.inverse(), q)
+            found.insert(0, q)
+        return np.array(found)
+
+    if not targets.moving:
+        return optimum_through(problem, timetables, waypoints(np.zeros(len(HEIGHTS))))[0]
+    motions = [
+        optimum_through(problem, [nodes], waypoints((1 - np.array(nodes) / problem.intervals) * problem.max_duration))
+        for nodes in timetables
+    ]
+    return min(motions, key=lambda motion: motion[1])[0]
 
 
 @lru_cache(maxsize=64)

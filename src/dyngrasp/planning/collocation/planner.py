@@ -141,12 +141,14 @@ class CollocationPlanner:
             gripper_start: (m,) present posture of the gripper (rad), at rest; open if left out.
             start_time: Time of the first grid point on the common clock (s).
 
+        A moving part is met when and where the targets say: then the durations of approach and grasp are given.
+
         Returns:
             The plan if every phase converged and the audit passed; else what went wrong, as a status.
         """
         began = time.perf_counter()
         start, paths, reserves = _state(q_start), self._gripper_paths(targets, gripper_start), self._reserves
-        problems = self._problems(start, targets, paths, reserves)
+        problems = self._problems(start, targets, paths, reserves, start_time)
         timings = {"problems": 1e3 * (time.perf_counter() - began)}
         solutions: list[Solution] = []
         for name, problem in zip(PHASE_NAMES, problems, strict=True):
@@ -161,7 +163,7 @@ class CollocationPlanner:
             raised = reserves.raised(report, solutions[-1].require())
             if raised is None:
                 break
-            reserves, problems = raised, self._problems(start, targets, paths, raised)
+            reserves, problems = raised, self._problems(start, targets, paths, raised, start_time)
             again = {}
             for phase in (_PHASE_OF_RESERVE[entry.name] for entry in report.failures):
                 again[phase] = self.solver.solve(problems[phase], solutions[phase].trajectory)
@@ -199,11 +201,15 @@ class CollocationPlanner:
         return plan, report
 
     def phase_problems(
-        self, q_start: Array | JointState, targets: GraspTargets, gripper_start: Array | None = None
+        self,
+        q_start: Array | JointState,
+        targets: GraspTargets,
+        gripper_start: Array | None = None,
+        start_time: float = 0.0,
     ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         """The three problems that `plan` solves, in the order of `PHASE_NAMES`; arguments as there."""
         paths = self._gripper_paths(targets, gripper_start)
-        return self._problems(_state(q_start), targets, paths, self._reserves)
+        return self._problems(_state(q_start), targets, paths, self._reserves, start_time)
 
     @property
     def _reserves(self) -> _Reserves:
@@ -211,27 +217,32 @@ class CollocationPlanner:
         return _Reserves(settings.funnel_margin * (100 / settings.intervals) ** 2, settings.hold_safety)
 
     def _problems(
-        self, start: BoundaryState, targets: GraspTargets, paths: tuple[GripperPath, ...], reserves: _Reserves
+        self,
+        start: BoundaryState,
+        targets: GraspTargets,
+        paths: tuple[GripperPath, ...],
+        reserves: _Reserves,
+        start_time: float,
     ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         task, settings = self.task, self.settings
         bounds = [path.shortest_duration(task.gripper.velocity, task.gripper.acceleration) for path in paths]
         empty, loaded = task.robot_empty, task.robot_loaded(targets.grasp)
         torque = constraints.torque_rows(empty, settings.intervals, settings.torque_fraction)
-        approach = self._phase("approach", start, targets.pregrasp, (torque,), bounds[0], settings.max_duration)
-        approach = replace(approach, constraints=(torque, self._funnel(approach, targets, paths[0], reserves.funnel)))
-        longest = task.settings.grasp_duration_max
+        shortest, longest = max(bounds[1], task.settings.grasp_duration_min), task.settings.grasp_duration_max
         if bounds[1] > longest:
             raise InvalidProblem(
                 f"grasp: {task.gripper.name} needs {bounds[1]:.3f} s to close, grasp_duration_max is {longest:g} s"
             )
-        grasp = self._phase(
-            "grasp",
-            targets.pregrasp,
-            targets.grasped,
-            (torque, self._tube(targets, paths[1])),
-            max(bounds[1], task.settings.grasp_duration_min),
-            longest,
-        )
+        spans = [(bounds[0], settings.max_duration), (shortest, longest)]
+        if targets.moving:
+            # The part waits for nobody: it is where the targets say at their time alone.
+            until_pregrasp = targets.grasp_time - targets.grasp_duration - start_time
+            spans = [_only(until_pregrasp, *spans[0], "approach"), _only(targets.grasp_duration, *spans[1], "grasp")]
+        approach = self._phase("approach", start, targets.pregrasp, (torque,), *spans[0])
+        funnel = self._funnel(approach, targets, paths[0], reserves.funnel, start_time)
+        approach = replace(approach, constraints=(torque, funnel))
+        tube = self._tube(targets, paths[1])
+        grasp = self._phase("grasp", targets.pregrasp, targets.grasped, (torque, tube), *spans[1])
         torque = constraints.torque_rows(loaded, settings.intervals, settings.torque_fraction)
         deliver = self._phase("deliver", targets.grasped, targets.place, (torque,), 0.0, settings.max_duration)
         carried = reserves.carried or within_speed_limits(deliver, best_duration(deliver))
@@ -289,10 +300,22 @@ class CollocationPlanner:
         T = gripper.T_flange_hand
         return gripper.grasp_point_many(path.position) @ T.rotation.T + T.translation
 
-    def _funnel(self, problem: PhaseProblem, targets: GraspTargets, path: GripperPath, margin: float) -> NodeConstraint:
+    def _grasp_frames(self, targets: GraspTargets, start: float, end: float) -> pin.SE3 | list[pin.SE3]:
+        """The grasp frame at the grid points between two times (s); the only one of a part at rest."""
+        if not targets.moving:
+            return targets.T_world_grasp
+        times = np.linspace(start, end, self.settings.intervals + 1)
+        return [targets.T_world_object_at(t) * targets.grasp.T_object_grasp for t in times]
+
+    def _funnel(
+        self, problem: PhaseProblem, targets: GraspTargets, path: GripperPath, margin: float, start_time: float
+    ) -> NodeConstraint:
         """The funnel with its margin, or with what the boundary states leave of it."""
         funnel = constraints.funnel(
-            self.task.robot, self._grasp_points(path), targets.T_world_grasp, self.task.grasp_object.funnel
+            self.task.robot,
+            self._grasp_points(path),
+            self._grasp_frames(targets, start_time, targets.grasp_time - targets.grasp_duration),
+            self.task.grasp_object.funnel,
         )
         ends = np.vstack([problem.start_position, problem.end_position])
         at_ends = np.empty((2, 1))
@@ -307,7 +330,7 @@ class CollocationPlanner:
             self.task.robot,
             self._grasp_points(path),
             self.task.T_flange_closed(targets.grasp).rotation,
-            targets.T_world_grasp,
+            self._grasp_frames(targets, targets.grasp_time - targets.grasp_duration, targets.grasp_time),
             settings.lateral_tolerance,
             settings.dip_tolerance,
             settings.tilt_tolerance,
@@ -334,6 +357,15 @@ class CollocationPlanner:
     def _T_flange_object(self, targets: GraspTargets) -> pin.SE3:
         """The part in the flange frame as the closed hand holds it."""
         return self.task.T_flange_closed(targets.grasp) * targets.grasp.T_object_grasp.inverse()
+
+
+def _only(duration: float, shortest: float, longest: float, phase: str) -> tuple[float, float]:
+    """Bounds that leave one duration (s), which must be within the others."""
+    if not shortest - 1e-9 <= duration <= longest + 1e-9:
+        raise InvalidProblem(
+            f"{phase}: the part is met after {duration:.3f} s, possible are {shortest:.3f} to {longest:g} s"
+        )
+    return duration, duration
 
 
 def _state(q_start: Array | JointState) -> BoundaryState:

@@ -25,7 +25,11 @@ class PhasePlanner(Protocol):
     """What states the problems of whole phases; the offline planner does."""
 
     def phase_problems(
-        self, q_start: JointState, targets: GraspTargets, gripper_start: Array | None = None
+        self,
+        q_start: JointState,
+        targets: GraspTargets,
+        gripper_start: Array | None = None,
+        start_time: float = 0.0,
     ) -> tuple[PhaseProblem, PhaseProblem, PhaseProblem]:
         """The problems of the three phases from a moving start."""
         ...
@@ -59,7 +63,7 @@ class FullProblem:
     ) -> tuple[tuple[PhaseProblem, ...] | None, str]:
         """The problems from a state with `left` (s) of the approach ahead, or None and why there are none."""
         try:
-            problems = self.planner.phase_problems(state.arm, targets, state.gripper.position)
+            problems = self.planner.phase_problems(state.arm, targets, state.gripper.position, state.arm.t)
         except DyngraspError as error:
             return None, str(error)
         rows = tuple(recovery.soften(row) if row.name == "funnel" else row for row in problems[APPROACH].constraints)

@@ -82,6 +82,7 @@ class TargetUpdater:
             gripper_open=previous.gripper_open,
             gripper_closed=previous.gripper_closed,
             grasp_time=grasp_time,
+            grasp_duration=grasp_duration,
             twist_world=twist,
         )
 
