@@ -7,9 +7,11 @@ but what they say reaches the filter only when exposure, transfer and detection 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.part_tracker import Frame, PartTracker
@@ -93,6 +95,14 @@ class CameraPoses:
     def estimate(self, truth: Truth, t: float) -> PoseEstimate:
         """What the filter knows at time t (s) from the pictures that have arrived by then."""
         return self.tracker.estimate(t)
+
+    def finish(self, meta: dict[str, Any] | None = None) -> VisionRecord:
+        """The record of every frame that has arrived."""
+        tracker = self.tracker
+        reports = tuple(tracker.reports)
+        pictures = {k: picture for k, picture in self.pictures.items() if k < len(reports)}
+        names = tracker.robot.joint_names
+        return VisionRecord(names, tracker.solver.camera, tracker.prior, reports, pictures, dict(meta or {}))
 
     def _take(self) -> None:
         s = self.settings

@@ -15,13 +15,13 @@ import pinocchio as pin
 from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_episode
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.closed_loop.replanning_loop import ReplanEvent
+from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.metrics import Outcome, judge
 from dyngrasp.experiments.provenance import versions
 from dyngrasp.experiments.replanning import replanning_loop, replanning_summary
 from dyngrasp.experiments.vision import camera_poses, films, vision_summary
 from dyngrasp.experiments.workcell import Workcell
-from dyngrasp.perception.part_tracker import FrameReport
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved, ranked_grasp_targets
 from dyngrasp.planning.problem import PlanResult
@@ -50,7 +50,10 @@ class PlannedTrial:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedTrial:
-    """What happened in the plant, the verdict, the plan carried out in the end, every replan and every picture."""
+    """What happened in the plant, the verdict, the plan carried out in the end, every replan, and what the camera saw.
+
+    `not_taken` are the times at which a pose was too uncertain for a replan.
+    """
 
     record: EpisodeRecord
     outcome: Outcome
@@ -59,7 +62,7 @@ class ExecutedTrial:
     targets: GraspTargets
     replans: tuple[ReplanEvent, ...] = ()
     not_taken: tuple[float, ...] = ()
-    frames: tuple[FrameReport, ...] = ()
+    vision: VisionRecord | None = None
 
 
 def planner_for(workcell: Workcell) -> CollocationPlanner:
@@ -151,11 +154,12 @@ def execute_trial(
         scene, plan.arm[0].position[0], plan.gripper[0].position[0], trial.T_world_object, t=plan.start_time
     )
     controller = grasp_controller(task, planned.targets.grasp, period)
+    meta = {"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()}
     with ExitStack() as stack:
-        vision = stack.enter_context(camera_poses(workcell, trial, plan, scene)) if films(workcell) else None
-        if vision is not None:
-            plant = vision.filmed(plant)
-        loop = replanning_loop(workcell, trial, plan, planned.targets, planner or planner_for(workcell), vision)
+        camera = stack.enter_context(camera_poses(workcell, trial, plan, scene)) if films(workcell) else None
+        if camera is not None:
+            plant = camera.filmed(plant)
+        loop = replanning_loop(workcell, trial, plan, planned.targets, planner or planner_for(workcell), camera)
         record = run_episode(
             plan,
             plant,
@@ -163,14 +167,14 @@ def execute_trial(
             EpisodeSettings(control_period=period),
             replanning=loop,
             progress=progress,
-            meta={"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()},
+            meta=meta,
         )
-    frames = () if vision is None else tuple(vision.tracker.reports)
+    vision = None if camera is None else camera.finish(meta)
     targets, events, not_taken = planned.targets, (), ()
     if loop is not None:
         plan, targets, events, not_taken = loop.newest, loop.targets, tuple(loop.events), tuple(loop.not_taken)
     outcome = judge(plan, record, task, targets.grasp)
-    return ExecutedTrial(record, outcome, scene, plan, targets, events, not_taken, frames)
+    return ExecutedTrial(record, outcome, scene, plan, targets, events, not_taken, vision)
 
 
 def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None) -> dict[str, Any]:
@@ -181,7 +185,7 @@ def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None)
         "cause": executed.outcome.cause if executed else f"planning: {result.status}: {result.message}",
         "criteria": executed.outcome.summary() if executed else {},
         "replanning": replanning_summary(executed.replans, executed.not_taken) if executed else {},
-        "vision": vision_summary(executed.frames) if executed else {},
+        "vision": vision_summary(executed.vision) if executed else {},
         "phases": result.plan.durations.tolist() if result.plan else [],
         "planning_ms": planned.planning_ms,
         "planning_attempts": planned.attempts,

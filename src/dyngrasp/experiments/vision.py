@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.closed_loop.camera_poses import CameraPoses, CameraPosesSettings
+from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.scenario import Scenario
 from dyngrasp.experiments.workcell import Workcell
@@ -19,7 +20,7 @@ from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.catalogue import load_camera
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
-from dyngrasp.perception.part_tracker import FrameReport, PartTracker, PartTrackerSettings
+from dyngrasp.perception.part_tracker import PartTracker, PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilterSettings
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
@@ -108,12 +109,14 @@ def tracker_settings(scenario: Scenario) -> PartTrackerSettings:
     return PartTrackerSettings(filter=replace(pose_filter, shared_error=(float(shared[0]), float(shared[1]))))
 
 
-def vision_summary(reports: Sequence[FrameReport]) -> dict[str, Any]:
+def vision_summary(vision: VisionRecord | None) -> dict[str, Any]:
     """Pictures of an episode: how many, what the filter said, how many showed the part."""
-    if not reports:
+    if vision is None or not vision.reports:
         return {}
+    reports = vision.reports
     return {
         "frames": len(reports),
+        "pictures_kept": len(vision.pictures),
         "recognised": sum(report.verdict is not None for report in reports),
         "verdicts": dict(Counter(report.verdict.value for report in reports if report.verdict is not None)),
         "markers_mean": float(np.mean([len(report.frame.seen) for report in reports])),

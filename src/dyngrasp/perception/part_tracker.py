@@ -111,7 +111,7 @@ class PartTracker:
         self.filter = PoseFilter(self.settings.filter, prior)
         self.solver, self.prior = solver, prior
         self.reports: list[FrameReport] = []
-        self._robot, self._gripper = robot, gripper
+        self.robot, self.gripper = robot, gripper
         self._underway: deque[Frame] = deque()
 
     def expect(self, frame: Frame) -> None:
@@ -135,7 +135,7 @@ class PartTracker:
     def look(self, frame: Frame) -> FrameReport:
         """Take in a frame that has just arrived."""
         sighting = self.solver.solve(frame.markers)
-        T_world_hand: pin.SE3 = self._robot.forward_kinematics(frame.arm_position) * self._gripper.T_flange_hand
+        T_world_hand: pin.SE3 = self.robot.forward_kinematics(frame.arm_position) * self.gripper.T_flange_hand
         T_world_camera = T_world_hand * self.solver.camera.T_hand_camera
         candidates = [
             replace(c, covariance=self.settings.correlation * c.covariance).in_world(
