@@ -17,7 +17,35 @@ _no_replan: dict[str, Any] = {
     "default": [],
     "help": "keep the first plan whatever becomes known of the pose, for comparison",
 }
+_POSES = {
+    "camera": ("pose.source=camera", "replanner.enabled=true"),
+    "noise": ("pose.source=noise",),
+    "truth": (
+        "pose.source=truth",
+        *(f"pose.{key}=0" for key in ("position_mm", "rotation_deg", "along_mm", "across_mm", "up_mm")),
+    ),
+}
 _SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"
+
+
+class _Pose(argparse.Action):
+    """`--pose`: overrides that come before all others, so that `--set` and `--no-replan` have the last word."""
+
+    def __call__(
+        self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: str | None = None
+    ) -> None:
+        namespace.overrides = [*_POSES[values], *namespace.overrides]
+
+
+_pose: dict[str, Any] = {
+    "action": _Pose,
+    "choices": tuple(_POSES),
+    "dest": "overrides",
+    "default": [],
+    "help": "where the pose of the part comes from: pictures of the camera on the hand, which the replanner follows "
+    "(table [camera], defaults without one); a noise model; or the truth, without the scenario's errors. Short for "
+    "--set pose.source=…",
+}
 
 
 def argument_parser(version: str) -> argparse.ArgumentParser:
@@ -35,6 +63,7 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     run.add_argument("--out", metavar="DIR", help="where the results go; default: out/<name of the scenario>")
     run.add_argument("--seed", type=_seed, metavar="S", help=_SEED)
     run.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
+    run.add_argument("--pose", **_pose)
     run.add_argument("--no-replan", **_no_replan)
     run.add_argument("--no-video", action="store_false", dest="video", help="do not render")
 
@@ -49,6 +78,7 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     study.add_argument("--trials", type=_count, metavar="N", required=True, help="number of trials")
     study.add_argument("--seed", type=_seed, metavar="S", help="every trial's own seed is drawn from this one")
     study.add_argument("--out", metavar="DIR", required=True, help="where trials.parquet and study.json go")
+    study.add_argument("--pose", **_pose)
     study.add_argument("--no-replan", **_no_replan)
     study.add_argument("--workers", type=_count, metavar="W", help="processes; default: one a core")
     study.add_argument("--json", metavar="FILE", help="write the rows also as JSON, with machine and versions")
