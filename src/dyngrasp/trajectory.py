@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from dyngrasp.errors import InvalidTrajectory, PlanFileError
@@ -56,10 +57,10 @@ class Trajectory:
         """N, the number of grid intervals."""
         return self.position.shape[0] - 1
 
-    @property
+    @cached_property
     def times(self) -> Array:
         """(N+1,) grid times from 0 to the duration (s)."""
-        return np.linspace(0.0, self.duration, self.intervals + 1)
+        return read_only(np.linspace(0.0, self.duration, self.intervals + 1))
 
     def sample(self, t: float) -> JointState:
         """State at one time, clamped to [0, duration]; see `sample_many`."""
@@ -80,22 +81,50 @@ class Trajectory:
         Returns:
             Position, velocity, acceleration, each (M, n).
         """
-        step = self.duration / self.intervals
-        scaled = np.clip(np.asarray(times, dtype=float), 0.0, self.duration) / step
-        k = np.minimum(scaled.astype(int), self.intervals - 1)
-        s = (scaled - k)[:, None]
-        q, w, v = (table.take(k, axis=0) for table in (self.position, self.velocity, self.acceleration))
-        dv = self.acceleration.take(k + 1, axis=0) - v
-        position = q + (step * s) * w + (step**2 * s**2 / 2) * v + (step**2 * (s**3 / 6 + s / 12)) * dv
-        velocity = w + (step * s) * v + (step * s**2 / 2) * dv
-        return position, velocity, v + s * dv
+        times = np.asarray(times, dtype=float)
+        return _interpolated(self.duration, self.position, self.velocity, self.acceleration, times)
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
-        half_step = self.duration / self.intervals / 2
-        defect_q = np.diff(self.position, axis=0) - half_step * (self.velocity[1:] + self.velocity[:-1])
-        defect_w = np.diff(self.velocity, axis=0) - half_step * (self.acceleration[1:] + self.acceleration[:-1])
-        return float(max(np.abs(defect_q).max(), np.abs(defect_w).max()))
+        return _largest_defect(self.duration, self.position, self.velocity, self.acceleration)
+
+
+@njit(cache=True, error_model="numpy")
+def _interpolated(duration, position, velocity, acceleration, times):
+    """`Trajectory.sample_many`; compiled, for controllers and audits ask for little and often."""
+    N, n = position.shape[0] - 1, position.shape[1]
+    step = duration / N
+    q, w, v = np.empty((times.size, n)), np.empty((times.size, n)), np.empty((times.size, n))
+    for m in range(times.size):
+        scaled = min(max(times[m], 0.0), duration) / step
+        k = max(min(int(scaled), N - 1), 0)
+        s = scaled - k
+        for i in range(n):
+            v_k = acceleration[k, i]
+            dv = acceleration[k + 1, i] - v_k
+            q[m, i] = (
+                position[k, i]
+                + (step * s) * velocity[k, i]
+                + (step**2 * s**2 / 2) * v_k
+                + (step**2 * (s**3 / 6 + s / 12)) * dv
+            )
+            w[m, i] = velocity[k, i] + (step * s) * v_k + (step * s**2 / 2) * dv
+            v[m, i] = v_k + s * dv
+    return q, w, v
+
+
+@njit(cache=True, error_model="numpy")
+def _largest_defect(duration, position, velocity, acceleration):
+    half_step, worst = duration / (position.shape[0] - 1) / 2, 0.0
+    for k in range(position.shape[0] - 1):
+        for i in range(position.shape[1]):
+            in_q = position[k + 1, i] - position[k, i] - half_step * (velocity[k + 1, i] + velocity[k, i])
+            in_w = velocity[k + 1, i] - velocity[k, i] - half_step * (acceleration[k + 1, i] + acceleration[k, i])
+            for defect in (abs(in_q), abs(in_w)):
+                # A NaN, once found, stays.
+                if not defect <= worst and worst == worst:
+                    worst = defect
+    return worst
 
 
 @dataclass(frozen=True)

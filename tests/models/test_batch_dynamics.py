@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 from dyngrasp.models.assembly import assemble
-from dyngrasp.models.batch_dynamics import BatchModel, wrench_on
+from dyngrasp.models.batch_dynamics import BatchModel, cosine_sine, wrench_on
 from dyngrasp.models.catalogue import load_robot
 from dyngrasp.models.robot import read_robot
 
@@ -14,13 +14,19 @@ M = 60
 
 @pytest.fixture
 def motion(robot):
-    return np.random.default_rng(1).normal(size=(3, M, robot.n))
+    """Positions, velocities and accelerations, (n, M) each."""
+    return np.random.default_rng(1).normal(size=(3, robot.n, M))
+
+
+def one_by_one(*motion):
+    """(q, w, v) of each sample."""
+    return zip(*(x.T for x in motion), strict=True)
 
 
 def test_torques_are_pinocchios(robot, payload, motion):
     loaded = robot.with_payload(payload)
     torque, _ = BatchModel.from_pinocchio(loaded.loaded_model).inverse_dynamics(*motion)
-    expected = [loaded.inverse_dynamics(q, w, v) for q, w, v in zip(*motion, strict=True)]
+    expected = np.transpose([loaded.inverse_dynamics(*sample) for sample in one_by_one(*motion)])
     # Some thousand roundings of torques up to 10³ Nm.
     np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
@@ -28,9 +34,9 @@ def test_torques_are_pinocchios(robot, payload, motion):
 def test_gravity_and_armature_are_the_models(robot):
     model = pin.Model(robot.loaded_model)
     model.gravity.linear = np.array([1.0, -2.0, 3.0])
-    q, zero = np.random.default_rng(2).normal(size=(M, robot.n)), np.zeros((M, robot.n))
+    q, zero = np.random.default_rng(2).normal(size=(robot.n, M)), np.zeros((robot.n, M))
     torque, _ = BatchModel.from_pinocchio(model).inverse_dynamics(q, zero, zero)
-    expected = [pin.computeGeneralizedGravity(model, model.createData(), x) for x in q]
+    expected = np.transpose([pin.computeGeneralizedGravity(model, model.createData(), x) for x in q.T])
     np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
     model.armature = model.armature + 7.0
     heavier, _ = BatchModel.from_pinocchio(model).inverse_dynamics(q, zero, zero + 1.0)
@@ -43,12 +49,12 @@ def test_poses_of_frames_on_any_link_and_on_the_world(robot, motion):
     model, data, tree = robot.pin_model, robot.pin_model.createData(), BatchModel.from_pinocchio(robot.pin_model)
     offset = pin.SE3(pin.exp3(np.array([0.3, -1.2, 0.7])), np.array([0.1, -0.2, 0.3]))
     R, p = tree.poses(motion[0], tree.attach([(joint, offset) for joint in range(model.njoints)]))
-    for k, q in enumerate(motion[0]):
+    for k, q in enumerate(motion[0].T):
         pin.forwardKinematics(model, data, q)
         for joint in range(model.njoints):
             expected = data.oMi[joint] * offset
-            np.testing.assert_allclose(R[k, joint], expected.rotation, rtol=0, atol=1e-13)
-            np.testing.assert_allclose(p[k, joint], expected.translation, rtol=0, atol=1e-13)
+            np.testing.assert_allclose(R[joint, ..., k], expected.rotation, rtol=0, atol=1e-13)
+            np.testing.assert_allclose(p[joint, :, k], expected.translation, rtol=0, atol=1e-13)
 
 
 def test_poses_of_a_tree_that_branches(gripper):
@@ -59,12 +65,12 @@ def test_poses_of_a_tree_that_branches(gripper):
     frames = tree.attach([(int(body.parentJoint), pin.SE3(body.placement)) for body in geometry.geometryObjects])
     data, placed = model.createData(), pin.GeometryData(geometry)
     postures = np.random.default_rng(3).normal(size=(20, model.nq))
-    R, p = tree.poses(postures, frames)
+    R, p = tree.poses(np.ascontiguousarray(postures.T), frames)
     for k, q in enumerate(postures):
         pin.updateGeometryPlacements(model, data, geometry, placed, q)
         expected = [(placed.oMg[i].rotation, placed.oMg[i].translation) for i in range(len(geometry.geometryObjects))]
-        np.testing.assert_allclose(R[k], [rotation for rotation, _ in expected], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(p[k], [position for _, position in expected], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(R[..., k], [rotation for rotation, _ in expected], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(p[..., k], [position for _, position in expected], rtol=0, atol=1e-13)
 
 
 def test_wrench_is_what_a_body_on_the_flange_adds_at_the_last_joint(robot, payload, motion):
@@ -76,10 +82,10 @@ def test_wrench_is_what_a_body_on_the_flange_adds_at_the_last_joint(robot, paylo
     T = pin.SE3(on_flange.rotations[0], on_flange.positions[0])
     wrench = wrench_on(T.act(payload), tip)
     model, data = robot.pin_model, robot.pin_model.createData()
-    for k, (q, w, v) in enumerate(zip(*motion, strict=True)):
+    for k, (q, w, v) in enumerate(one_by_one(*motion)):
         J = pin.computeFrameJacobian(model, data, q, robot.tip_id, pin.LOCAL)
-        at_flange = T.actInv(pin.Force(wrench[k])).vector
-        expected = loaded.inverse_dynamics(q, w, v) - bare[k]
+        at_flange = T.actInv(pin.Force(wrench[:, k])).vector
+        expected = loaded.inverse_dynamics(q, w, v) - bare[:, k]
         np.testing.assert_allclose(J.T @ at_flange, expected, rtol=0, atol=1e-11 * np.abs(bare).max())
 
 
@@ -92,8 +98,20 @@ def test_other_joints_are_refused():
 
 def test_not_a_number_goes_through(make_chain):
     robot = read_robot(make_chain(3))
-    q = np.zeros((2, 3))
-    q[1, 0] = np.nan
-    torque, _ = BatchModel.from_pinocchio(robot.pin_model).inverse_dynamics(q, np.zeros((2, 3)), np.zeros((2, 3)))
-    assert np.isfinite(torque[0]).all()
-    assert np.isnan(torque[1]).any()
+    q = np.zeros((3, 2))
+    q[0, 1] = np.nan
+    torque, _ = BatchModel.from_pinocchio(robot.pin_model).inverse_dynamics(q, np.zeros((3, 2)), np.zeros((3, 2)))
+    assert np.isfinite(torque[:, 0]).all()
+    assert np.isnan(torque[:, 1]).any()
+
+
+@pytest.mark.parametrize("largest", [0.8, 10.0, 1e6])
+def test_cosine_and_sine_are_the_mathematical_librarys(largest):
+    angles = np.random.default_rng(4).uniform(-largest, largest, (7, 5000))
+    # Multiples of a quarter turn are where the pieces meet.
+    angles[0, :9] = np.arange(-4, 5) * np.pi / 2
+    angles[1, :9] = np.arange(-4, 5) * np.pi / 2 + np.pi / 4
+    cosine, sine = cosine_sine(angles)
+    np.testing.assert_allclose(cosine, np.cos(angles), rtol=0, atol=5e-16)
+    np.testing.assert_allclose(sine, np.sin(angles), rtol=0, atol=5e-16)
+    assert np.isnan(np.concatenate(cosine_sine(np.array([[np.nan, np.inf, -np.inf]])))).all()

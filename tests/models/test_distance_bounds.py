@@ -13,6 +13,7 @@ from dyngrasp.models.distance_bounds import (
     heights,
     near_boxes,
     near_capsules,
+    seen_from,
     tighten,
     tracks,
 )
@@ -57,7 +58,8 @@ def walk(random: np.random.Generator, samples: int, spread: float) -> list[pin.S
 
 
 def arrays(motion: list[pin.SE3]) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([T.rotation for T in motion]), np.array([T.translation for T in motion])
+    """Rotations (3, 3, S) and positions (3, S)."""
+    return np.stack([T.rotation for T in motion], axis=-1), np.stack([T.translation for T in motion], axis=-1)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -85,7 +87,7 @@ def test_bounds_to_boxes_and_their_neighbours(name, seed):
     ends, radius = bounding_capsule(SHAPES[name])
     capsules = Capsules(np.zeros(1, np.int64), ends[None], np.array([radius]))
     R, p = arrays(body)
-    seen = tracks(R[:, None], p[:, None], *arrays(part), capsules)
+    seen = tracks(*seen_from(*arrays(part), R[None], p[None]), capsules)
     start, stop = 3, samples - 4
     first, box, rows = near_boxes(
         seen.ends, seen.travel, capsules.radii, np.zeros(1, np.int64), np.array([start]), np.array([stop]),
@@ -130,8 +132,8 @@ def test_bounds_between_capsules_are_exact_where_they_are_apart(seed):
     capsules = Capsules(
         np.arange(3), np.array([ends for ends, _ in bounding]), np.array([radius for _, radius in bounding])
     )
-    R, p = (np.stack(column, axis=1) for column in zip(*(arrays(motion) for motion in motions), strict=True))
-    world = tracks(R, p, np.tile(np.eye(3), (samples, 1, 1)), np.zeros((samples, 3)), capsules)
+    R, p = (np.stack(column) for column in zip(*(arrays(motion) for motion in motions), strict=True))
+    world = tracks(R, p, capsules)
     first, second = np.array([0, 0, 1]), np.array([1, 2, 2])
     kept, rows = near_capsules(world.ends, world.travel, capsules.radii, first, second, horizon)
     for n, (i, j) in enumerate(zip(first, second, strict=True)):
@@ -158,9 +160,8 @@ def test_parallel_and_crossing_segments():
         ],
         dtype=float,
     )
-    R, zero = np.eye(3)[None, None], np.zeros((1, 3))
     capsules = Capsules(np.zeros(5, np.int64), segments, np.zeros(5))
-    world = tracks(R, np.zeros((1, 1, 3)), np.eye(3)[None], zero, capsules)
+    world = tracks(np.eye(3)[None, :, :, None], np.zeros((1, 3, 1)), capsules)
     others = np.arange(1, 5)
     kept, rows = near_capsules(world.ends, world.travel, np.zeros(5), np.zeros(4, np.int64), others, 10.0)
     np.testing.assert_array_equal(kept, range(4))
@@ -175,12 +176,12 @@ def test_heights_are_those_of_the_lowest_points():
     R, p = arrays(motion)
     ends, radius = bounding_capsule(SHAPES["capsule"])
     capsules = Capsules(np.zeros(1, np.int64), ends[None], np.array([radius]))
-    world = tracks(R[:, None], p[:, None], np.tile(np.eye(3), (30, 1, 1)), np.zeros((30, 3)), capsules)
+    world = tracks(R[None], p[None], capsules)
     ground = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
     expected = [distance(SHAPES["capsule"], T, ground, pin.SE3.Identity()) for T in motion]
     np.testing.assert_allclose(heights(world.ends, capsules.radii, np.zeros(1, np.int64))[0], expected, atol=1e-12)
     half = np.array([0.01, 0.07, 0.03])
-    rows = box_heights(np.ascontiguousarray(R[:, 2]), p[:, 2].copy(), -half[None], half[None], 4)
+    rows = box_heights(R[2], p[2], -half[None], half[None], 4)
     expected = [distance(SHAPES["box"], T, ground, pin.SE3.Identity()) for T in motion]
     assert np.isposinf(rows[0, :4]).all()
     np.testing.assert_allclose(rows[0, 4:], expected[4:], atol=1e-12)

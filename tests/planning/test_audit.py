@@ -126,6 +126,14 @@ def lowered(plan: GraspPlan, task) -> GraspPlan:
     )
 
 
+def every_other(trajectory: Trajectory, k: int) -> Trajectory:
+    """The motion on every k-th grid point; between them it is another one."""
+    rows = slice(None, None, k)
+    return Trajectory(
+        trajectory.duration, trajectory.position[rows], trajectory.velocity[rows], trajectory.acceleration[rows]
+    )
+
+
 def off_the_rule(plan: GraspPlan) -> GraspPlan:
     acceleration = plan.arm[0].acceleration.copy()
     acceleration[5, 2] += 1e-5
@@ -369,9 +377,8 @@ def busier_pad(wrench: pin.Force, task, grasp) -> float:
     return max(shares)
 
 
-def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, task):
-    """The audit's numbers against Pinocchio, called for every sample by itself."""
-    report = audit(plan, targets, task)
+def one_sample_after_the_other(plan, targets, task, substeps: int) -> dict[str, float]:
+    """Worst values by Pinocchio, called for each sample by itself, on a grid `substeps` times as fine as the plan's."""
     robots = (task.robot_empty, task.robot_empty, task.robot_loaded(targets.grasp))
     torque, h, lateral, dip, angle, share = [], [], [], [], [], []
     part, gripper, model = task.grasp_object, task.gripper, task.robot.pin_model
@@ -379,7 +386,7 @@ def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, tas
     T_flange_closed = gripper.T_flange_hand * gripper.T_hand_grasp(targets.gripper_closed)
     part_in_grasp = targets.grasp.T_object_grasp.inverse().act(part.spatial_inertia)
     for phase, (arm, fingers, robot) in enumerate(zip(plan.arm, plan.gripper, robots, strict=True)):
-        for t in np.linspace(0.0, arm.duration, SUBSTEPS * arm.intervals + 1):
+        for t in np.linspace(0.0, arm.duration, substeps * arm.intervals + 1):
             state, q_h = arm.sample(t), fingers.sample(t).position
             q, w, v = state.position, state.velocity, state.acceleration
             torque.append(np.abs(robot.inverse_dynamics(q, w, v) / robot.limits.torque).max())
@@ -401,7 +408,7 @@ def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, tas
                 acceleration.linear = acceleration.linear + upward
                 wrench = part_in_grasp * acceleration + velocity.cross(part_in_grasp * velocity)
                 share.append(busier_pad(wrench, task, targets.grasp))
-    expected = {
+    return {
         "torque": max(torque),
         "funnel": min(h),
         "grasp_axis": max(lateral),
@@ -409,9 +416,30 @@ def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, tas
         "grasp_tilt": max(angle),
         "hold": max(share),
     }
-    for name, value in expected.items():
+
+
+def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, task):
+    report = audit(plan, targets, task)
+    for name, value in one_sample_after_the_other(plan, targets, task, 1).items():
         # Rounding of kinematics and dynamics; the funnel's wall climbs up to 30 m per metre.
         assert report[name].worst == pytest.approx(value, abs=1e-11), name
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("grasp_axis", "lateral_tolerance"), ("grasp_dip", "dip_tolerance"), ("grasp_tilt", "tilt_tolerance")],
+)
+def test_what_is_broken_between_two_grid_points_only_is_found(plan, targets, task, name, key):
+    """The hand goes aside half way through the grasp, between two points of a coarse grid; the limit lies between."""
+    aside = PLANS[name](plan, task)
+    coarse = with_arm(aside, *(every_other(phase, 20) for phase in aside.arm))
+    object.__setattr__(coarse, "gripper", tuple(every_other(phase, 20) for phase in aside.gripper))
+    grid, inside = (one_sample_after_the_other(coarse, targets, task, substeps)[name] for substeps in (1, SUBSTEPS))
+    assert abs(inside) > 1.1 * abs(grid), "no peak between the grid points"
+    strict = replace(task, settings=replace(task.settings, **{key: abs(grid + inside) / 2}))
+    entry = audit(coarse, targets, strict)[name]
+    assert not entry.ok
+    assert entry.worst == pytest.approx(inside, abs=1e-11)
 
 
 def test_entry_of_that_name_or_those_there_are(plan, targets, task):

@@ -12,11 +12,19 @@ import trimesh
 
 from dyngrasp.models.assembly import assemble
 from dyngrasp.planning import clearance
-from dyngrasp.planning.clearance import HORIZON, JOINT_STEP, RESOLUTION, cell_geometry, clearance_entries
+from dyngrasp.planning.clearance import (
+    HORIZON,
+    JOINT_STEP,
+    RESOLUTION,
+    Waypoints,
+    cell_geometry,
+    clearance_entries,
+    waypoints_of,
+)
 from dyngrasp.trajectory import PHASE_NAMES
 
 
-def straightforward(task, targets, motion):
+def straightforward(task, targets, waypoints):
     """Every pair of bodies at every sample, one after the other: slow, and nothing to go wrong in it."""
     assembly = assemble(task.robot, task.gripper)
     model, geometry = assembly.pin_model, assembly.geometry
@@ -35,36 +43,30 @@ def straightforward(task, targets, motion):
         distance = coal.distance(a, at[0], b, at[1], coal.DistanceRequest(), coal.DistanceResult())
         worst[name] = min(worst[name], distance)
 
-    for phase, (_, q, q_h) in motion.items():
-        chosen, last = [], None
-        for k in range(len(q)):
-            state = np.concatenate([q[k], q_h[k]])
-            following = np.concatenate([q[min(k + 1, len(q) - 1)], q_h[min(k + 1, len(q) - 1)]])
-            if last is None or k == len(q) - 1 or np.abs(following - last).max() > JOINT_STEP:
-                chosen.append(k)
-                last = state
-        for k in chosen:
-            pin.updateGeometryPlacements(model, data, geometry, placed, assembly.configuration(q[k], q_h[k]))
-            T_part = targets.T_world_object
-            if phase == "deliver":
-                T_part = pin.updateFramePlacement(model, data, assembly.flange_id) * T_flange_object
-            for i, body in enumerate(bodies):
-                on_hand = body.name in hand
-                if on_hand or body.parentJoint > 0:
-                    note("ground_clearance", body.geometry, placed.oMg[i], ground, pin.SE3.Identity())
-                    if phase == "approach" or body.name not in pads:
-                        for piece in pieces:
-                            note("part_clearance", body.geometry, placed.oMg[i], piece, T_part)
-                if phase == "deliver" and not on_hand:
+    for k in range(waypoints.times.size):
+        phase = "approach" if k < waypoints.closing else "grasp" if k < waypoints.lifted else "deliver"
+        q, q_h = waypoints.q[:, k], waypoints.q_h[:, k]
+        pin.updateGeometryPlacements(model, data, geometry, placed, assembly.configuration(q, q_h))
+        T_part = targets.T_world_object
+        if phase == "deliver":
+            T_part = pin.updateFramePlacement(model, data, assembly.flange_id) * T_flange_object
+        for i, body in enumerate(bodies):
+            on_hand = body.name in hand
+            if on_hand or body.parentJoint > 0:
+                note("ground_clearance", body.geometry, placed.oMg[i], ground, pin.SE3.Identity())
+                if phase == "approach" or body.name not in pads:
                     for piece in pieces:
-                        note("carried_clearance", piece, T_part, body.geometry, placed.oMg[i])
-            for (i, a), (j, b) in itertools.product(enumerate(bodies), enumerate(bodies)):
-                links = [n if body.name in hand else min(body.parentJoint, n) for body in (a, b)]
-                if links[1] - links[0] >= 3:
-                    note("self_clearance", a.geometry, placed.oMg[i], b.geometry, placed.oMg[j])
-            if phase == "deliver":
+                        note("part_clearance", body.geometry, placed.oMg[i], piece, T_part)
+            if phase == "deliver" and not on_hand:
                 for piece in pieces:
-                    note("carried_clearance", piece, T_part, ground, pin.SE3.Identity())
+                    note("carried_clearance", piece, T_part, body.geometry, placed.oMg[i])
+        for (i, a), (j, b) in itertools.product(enumerate(bodies), enumerate(bodies)):
+            links = [n if body.name in hand else min(body.parentJoint, n) for body in (a, b)]
+            if links[1] - links[0] >= 3:
+                note("self_clearance", a.geometry, placed.oMg[i], b.geometry, placed.oMg[j])
+        if phase == "deliver":
+            for piece in pieces:
+                note("carried_clearance", piece, T_part, ground, pin.SE3.Identity())
     return worst
 
 
@@ -78,18 +80,10 @@ def convex(path) -> coal.Convex:
     return coal.Convex(points, faces)
 
 
-def motion_of(plan, samples=80):
-    """(times, arm, gripper) of each phase, on a grid of its own."""
-    motion = {}
-    for name, arm, gripper, end in zip(PHASE_NAMES, plan.arm, plan.gripper, plan.phase_ends, strict=True):
-        local = np.linspace(0.0, arm.duration, samples)
-        motion[name] = (end - arm.duration + local, arm.sample_many(local)[0], gripper.sample_many(local)[0])
-    return motion
-
-
-def shifted(motion, joints):
-    """The same motion with the arm turned aside by some joint angles (n,)."""
-    return {name: (times, q + joints, q_h) for name, (times, q, q_h) in motion.items()}
+def with_times(waypoints, keep):
+    """Some of the samples, by index."""
+    closing, lifted = (int((np.asarray(keep) < k).sum()) for k in (waypoints.closing, waypoints.lifted))
+    return Waypoints(waypoints.times[keep], waypoints.q[:, keep], waypoints.q_h[:, keep], closing, lifted)
 
 
 @pytest.mark.parametrize(
@@ -106,9 +100,11 @@ def shifted(motion, joints):
 def test_the_same_as_measuring_everything(task, targets, plan, aside):
     offset = np.zeros(task.robot.n)
     offset[list(aside)] = list(aside.values())
-    motion = shifted(motion_of(plan, samples=30), offset)
-    expected = straightforward(task, targets, motion)
-    found = {entry.name: entry for entry in clearance_entries(task, targets, motion)}
+    all_of_them = waypoints_of(plan)
+    waypoints = with_times(all_of_them, np.arange(0, all_of_them.times.size, 3))
+    waypoints = replace(waypoints, q=waypoints.q + offset[:, None])
+    expected = straightforward(task, targets, waypoints)
+    found = {entry.name: entry for entry in clearance_entries(task, targets, waypoints)}
     assert set(found) == set(expected)
     for name, distance in expected.items():
         # Both stop within Coal's tolerance; how deep bodies are in each other, its expanding polytope finds less well.
@@ -118,21 +114,19 @@ def test_the_same_as_measuring_everything(task, targets, plan, aside):
 
 def test_entry_says_where_and_who(task, targets, plan):
     """What an entry names really is that far apart at that time."""
-    motion = motion_of(plan)
+    waypoints = waypoints_of(plan)
     cell = cell_geometry(task, targets.grasp.name)
-    for entry in clearance_entries(task, targets, motion):
+    for entry in clearance_entries(task, targets, waypoints):
         if entry.worst == HORIZON:
             assert entry.detail == ""
             continue
         one, other = entry.detail.split(" and ")
         at = []
-        for times, q, q_h in motion.values():
-            k = int(np.abs(times - entry.time).argmin())
-            if abs(times[k] - entry.time) < 1e-12:
-                R, p = cell.poses(q[k][None], q_h[k][None])
-                for T in (targets.T_world_object, pin.SE3(R[0, -1], p[0, -1]) * cell.T_flange_object):
-                    scene = clearance.Scene(R, p, T.rotation[None], T.translation[None], 0, 0)
-                    at.append(cell.distance(cell.names.index(one), cell.names.index(other), scene, 0))
+        for k in np.flatnonzero(np.abs(waypoints.times - entry.time) < 1e-12):
+            R, p = cell.poses(waypoints.q[:, [k]], waypoints.q_h[:, [k]])
+            for T in (targets.T_world_object, pin.SE3(R[-1, ..., 0], p[-1, :, 0]) * cell.T_flange_object):
+                scene = clearance.Scene(R, p, T.rotation[..., None], T.translation[:, None], 0, 0)
+                at.append(cell.distance(cell.names.index(one), cell.names.index(other), scene, 0))
         assert np.abs(np.array(at) - entry.worst).min() < 2 * RESOLUTION
 
 
@@ -151,8 +145,8 @@ def test_distances_are_mujocos(task, targets):
         q = random.uniform(limits.position_lower, limits.position_upper)
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
-        R, p = cell.poses(q[None], task.gripper.open_posture[None])
-        scene = clearance.Scene(R, p, np.eye(3)[None], np.zeros((1, 3)), 0, 0)
+        R, p = cell.poses(q[:, None], task.gripper.open_posture[:, None])
+        scene = clearance.Scene(R, p, np.eye(3)[..., None], np.zeros((3, 1)), 0, 0)
         for i, j in itertools.combinations(arm, 2):
             expected = mujoco.mj_geomDistance(model, data, names[cell.names[i]], names[cell.names[j]], 2.0, None)
             if expected > 0:
@@ -168,11 +162,11 @@ def test_distances_are_mujocos(task, targets):
 def test_pieces_and_ground_where_the_answer_is_known(task, targets):
     """The lowest vertex of each piece over the ground, for tilted parts."""
     cell = cell_geometry(task, targets.grasp.name)
-    R, p = cell.poses(task.place[None], task.gripper.open_posture[None])
+    R, p = cell.poses(task.place[:, None], task.gripper.open_posture[:, None])
     random = np.random.default_rng(1)
     for _ in range(5):
         T = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.2)
-        scene = clearance.Scene(R, p, T.rotation[None], T.translation[None], 0, 0)
+        scene = clearance.Scene(R, p, T.rotation[..., None], T.translation[:, None], 0, 0)
         for i, path in enumerate(task.grasp_object.piece_paths):
             vertices = np.asarray(trimesh.load_mesh(path).vertices)
             expected = (vertices @ T.rotation.T + T.translation)[:, 2].min()
@@ -182,35 +176,42 @@ def test_pieces_and_ground_where_the_answer_is_known(task, targets):
 
 def test_a_moving_part_is_met_where_it_is(task, targets, plan):
     """A part that falls through the hand on its way to where it is taken."""
-    motion = motion_of(plan)
+    waypoints = waypoints_of(plan)
     falling = np.array([0.0, 0.0, -0.5, 0.0, 0.0, 0.0])
     moving = replace(targets, grasp_time=float(plan.phase_ends[1]), twist_world=falling)
-    at_rest = {entry.name: entry for entry in clearance_entries(task, targets, motion)}
-    from_above = {entry.name: entry for entry in clearance_entries(task, moving, motion)}
+    at_rest = {entry.name: entry for entry in clearance_entries(task, targets, waypoints)}
+    from_above = {entry.name: entry for entry in clearance_entries(task, moving, waypoints)}
     assert at_rest["part_clearance"].ok
     # 0.5 s before the grasp the part would be 25 cm higher, inside the hand.
     assert not from_above["part_clearance"].ok
     assert from_above["ground_clearance"] == at_rest["ground_clearance"]
 
 
-@pytest.mark.parametrize("phase", PHASE_NAMES)
+@pytest.mark.parametrize("phase", range(3), ids=PHASE_NAMES)
 def test_not_a_number_never_passes(task, targets, plan, phase):
-    motion = motion_of(plan)
-    times, q, q_h = motion[phase]
-    q = q.copy()
-    q[7, 2] = np.nan
-    entries = clearance_entries(task, targets, motion | {phase: (times, q, q_h)})
-    assert not any(entry.ok for entry in entries)
+    waypoints = waypoints_of(plan)
+    q = waypoints.q.copy()
+    q[2, (0, waypoints.closing, waypoints.lifted)[phase] + 3] = np.nan
+    assert not any(entry.ok for entry in clearance_entries(task, targets, replace(waypoints, q=q)))
     nowhere = targets.T_world_object.copy()
     nowhere.translation = np.array([np.nan, 0.0, 0.0])
-    assert not any(entry.ok for entry in clearance_entries(task, replace(targets, T_world_object=nowhere), motion))
+    assert not any(entry.ok for entry in clearance_entries(task, replace(targets, T_world_object=nowhere), waypoints))
 
 
-def test_samples_are_no_farther_apart_than_stated(task, targets, plan):
-    table = np.cumsum(np.random.default_rng(0).uniform(-0.006, 0.006, (500, 4)), axis=0)
-    chosen = clearance._spread(table)
-    assert (chosen[0], chosen[-1]) == (0, 499)
-    assert np.abs(np.diff(table[chosen], axis=0)).max() <= JOINT_STEP
-    assert chosen.size < 400
-    coarse = np.array([[0.0], [1.0], [2.0]])
-    np.testing.assert_array_equal(clearance._spread(coarse), [0, 1, 2])
+@pytest.mark.parametrize("since", [-np.inf, 0.37, 3.5, 6.0])
+def test_samples_are_no_farther_apart_than_stated(plan, since):
+    waypoints = waypoints_of(plan, since)
+    both = np.vstack([waypoints.q, waypoints.q_h])
+    ends = [max(since, plan.start_time), *(t for t in plan.phase_ends if t > since)]
+    phases = [0, waypoints.closing, waypoints.lifted, waypoints.times.size]
+    kept = 0
+    for start, stop, T in zip(phases[:-1], phases[1:], plan.phase_ends, strict=True):
+        assert (stop == start) == (since >= T)
+        if stop > start:
+            assert waypoints.times[[start, stop - 1]] == pytest.approx(ends[kept : kept + 2], abs=1e-12)
+            kept += 1
+            # The path within an interval is taken as straight: joints that turn at different rates bend it a little.
+            assert np.abs(np.diff(both[:, start:stop], axis=1)).max() <= 1.02 * JOINT_STEP
+    for k, t in enumerate(waypoints.times):
+        sample = plan.sample(t)
+        np.testing.assert_allclose(both[:, k], [*sample.arm.position, *sample.gripper.position], atol=1e-9)

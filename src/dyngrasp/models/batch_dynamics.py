@@ -1,7 +1,8 @@
 """Kinematics and inverse dynamics of a tree of revolute joints for many samples at once, compiled.
 
 The numbers are Pinocchio's (the tests hold them to 1e-12); what is saved is a call into another language for every
-sample. Every joint frame is turned here so that its joint turns about z. Whatever is fixed to a link is brought
+sample. The samples are the last axis of every array: a loop over them is one that the compiler turns into vector
+instructions. Every joint frame is turned here so that its joint turns about z. Whatever is fixed to a link is brought
 into that frame once, with `BatchModel.attach`.
 """
 
@@ -92,33 +93,33 @@ class BatchModel:
         )
 
     def poses(self, q: Array, frames: Attachments) -> tuple[Array, Array]:
-        """Poses of K frames in the world: rotations (M, K, 3, 3), positions (M, K, 3) for q (M, n)."""
+        """Poses of K frames in the world: rotations (K, 3, 3, M), positions (K, 3, M) for q (n, M)."""
         return _poses(
-            np.cos(q), np.sin(q), self.parents, self.rotations, self.offsets,
+            *cosine_sine(q), self.parents, self.rotations, self.offsets,
             frames.links, frames.rotations, frames.positions,
         )  # fmt: skip
 
     def inverse_dynamics(self, q: Array, w: Array, v: Array) -> tuple[Array, Array]:
-        """Recursive Newton-Euler for a chain (each joint on the link before it); q, w, v (M, n).
+        """Recursive Newton-Euler for a chain (each joint on the link before it); q, w, v (n, M).
 
         Returns:
-            Torques (M, n) with gravity and armature (Nm), and the motion of the last link in its turned frame, (M, 9):
+            Torques (n, M) with gravity and armature (Nm), and the motion of the last link in its turned frame, (9, M):
             angular velocity, angular acceleration, and acceleration of the joint's origin less gravity (m/s²).
         """
         return _newton_euler(
-            np.cos(q), np.sin(q), w, v, self.rotations, self.offsets,
+            *cosine_sine(q), w, v, self.rotations, self.offsets,
             self.mass, self.first_moment, self.inertia, self.armature, self.gravity,
         )  # fmt: skip
 
 
 def wrench_on(body: pin.Inertia, motion: Array) -> Array:
-    """Force and moment about the origin that move a body, (M, 6), in the frame that `motion` (M, 9) is given in.
+    """Force and moment about the origin that move a body, (6, M), in the frame that `motion` (9, M) is given in.
 
     Args:
         body: Inertia in that frame.
         motion: As `BatchModel.inverse_dynamics` returns it; gravity is therefore in the force.
     """
-    return _wrenches(motion, body.mass, body.mass * body.lever, body.matrix()[3:, 3:])
+    return _wrench(motion, body.mass, body.mass * body.lever, np.ascontiguousarray(body.matrix()[3:, 3:]))
 
 
 def _axis(joint: pin.JointModel) -> Array:
@@ -135,126 +136,179 @@ def _z_onto(axis: Array) -> Array:
     return pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix()
 
 
+# π/2 in three parts, the first two of 33 bits: multiples below 2^20 are subtracted without rounding (Cody and Waite).
+_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+
+# Minimax polynomials of (sin r − r) / r³ and (cos r − 1 + r²/2) / r⁴ in r² for |r| ≤ π/4, those of fdlibm.
+_SINE = (
+    -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04, 2.75573137070700676789e-06,
+    -2.50507602534068634195e-08, 1.58969099521155010221e-10,
+)  # fmt: skip
+_COSINE = (
+    4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767294178e-05, -2.75573143513906633035e-07,
+    2.08757232129817482790e-09, -1.13596475577881948265e-11,
+)  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def cosine_sine(angles):
+    """Cosines and sines (n, M) of angles (n, M) below 10⁶ rad, to 2 ulp of 1; without branches, unlike libm's."""
+    cosine, sine = np.empty(angles.shape), np.empty(angles.shape)
+    for i in range(angles.shape[0]):
+        for s in range(angles.shape[1]):
+            x = angles[i, s]
+            quarter = np.floor(x / (np.pi / 2) + 0.5)
+            r = ((x - quarter * _HALF_PI[0]) - quarter * _HALF_PI[1]) - quarter * _HALF_PI[2]
+            z = r * r
+            p = _SINE[4] + z * _SINE[5]
+            p = _SINE[0] + z * (_SINE[1] + z * (_SINE[2] + z * (_SINE[3] + z * p)))
+            g = _COSINE[4] + z * _COSINE[5]
+            g = _COSINE[0] + z * (_COSINE[1] + z * (_COSINE[2] + z * (_COSINE[3] + z * g)))
+            near_sine, near_cosine = r + r * z * p, 1.0 - 0.5 * z + z * z * g
+            # Each quarter turn exchanges the two; the signs are + + − − for the sine, + − − + for the cosine.
+            odd = quarter - 2.0 * np.floor(quarter / 2.0)
+            sign = 1.0 - 2.0 * (np.floor(quarter / 2.0) - 2.0 * np.floor(quarter / 4.0))
+            sine[i, s] = sign * (near_sine + odd * (near_cosine - near_sine))
+            cosine[i, s] = sign * (1.0 - 2.0 * odd) * (near_cosine + odd * (near_sine - near_cosine))
+    return cosine, sine
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _poses(cosine, sine, parents, rotations, offsets, links, link_rotations, link_positions):
-    samples, n = cosine.shape
+    n, samples = cosine.shape
+    R, p = np.empty((n, 3, 3, samples)), np.empty((n, 3, samples))
+    for i in range(n):
+        fixed, offset = rotations[i], offsets[i]
+        if parents[i] < 0:
+            for a in range(3):
+                p[i, a] = offset[a]
+                for b in range(3):
+                    R[i, a, b] = fixed[a, b]
+        else:
+            _compose(R[parents[i]], p[parents[i]], fixed, offset, R[i], p[i])
+        for a in range(3):
+            x, y = R[i, a, 0], R[i, a, 1]
+            for s in range(samples):
+                x[s], y[s] = cosine[i, s] * x[s] + sine[i, s] * y[s], cosine[i, s] * y[s] - sine[i, s] * x[s]
     frames = links.size
-    R, p = np.empty((n, 3, 3)), np.empty((n, 3))
-    out_R, out_p = np.empty((samples, frames, 3, 3)), np.empty((samples, frames, 3))
-    for s in range(samples):
-        for i in range(n):
-            parent = parents[i]
-            c, d = cosine[s, i], sine[s, i]
+    out_R, out_p = np.empty((frames, 3, 3, samples)), np.empty((frames, 3, samples))
+    for f in range(frames):
+        if links[f] < 0:
             for a in range(3):
-                if parent < 0:
-                    x, y, z = rotations[i, a, 0], rotations[i, a, 1], rotations[i, a, 2]
-                    p[i, a] = offsets[i, a]
-                else:
-                    u0, u1, u2 = R[parent, a, 0], R[parent, a, 1], R[parent, a, 2]
-                    x = u0 * rotations[i, 0, 0] + u1 * rotations[i, 1, 0] + u2 * rotations[i, 2, 0]
-                    y = u0 * rotations[i, 0, 1] + u1 * rotations[i, 1, 1] + u2 * rotations[i, 2, 1]
-                    z = u0 * rotations[i, 0, 2] + u1 * rotations[i, 1, 2] + u2 * rotations[i, 2, 2]
-                    p[i, a] = p[parent, a] + u0 * offsets[i, 0] + u1 * offsets[i, 1] + u2 * offsets[i, 2]
-                R[i, a, 0], R[i, a, 1], R[i, a, 2] = c * x + d * y, c * y - d * x, z
-        for f in range(frames):
-            link = links[f]
-            for a in range(3):
-                if link < 0:
-                    out_p[s, f, a] = link_positions[f, a]
-                    for b in range(3):
-                        out_R[s, f, a, b] = link_rotations[f, a, b]
-                else:
-                    u0, u1, u2 = R[link, a, 0], R[link, a, 1], R[link, a, 2]
-                    t = link_positions[f]
-                    out_p[s, f, a] = p[link, a] + u0 * t[0] + u1 * t[1] + u2 * t[2]
-                    for b in range(3):
-                        T = link_rotations[f]
-                        out_R[s, f, a, b] = u0 * T[0, b] + u1 * T[1, b] + u2 * T[2, b]
+                out_p[f, a] = link_positions[f, a]
+                for b in range(3):
+                    out_R[f, a, b] = link_rotations[f, a, b]
+        else:
+            _compose(R[links[f]], p[links[f]], link_rotations[f], link_positions[f], out_R[f], out_p[f])
     return out_R, out_p
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
-def _newton(mass, h, inertia, ox, oy, oz, lx, ly, lz, ax, ay, az):
-    """Force and moment about the origin for angular velocity o, angular acceleration l, acceleration a.
-
-    f = m a + l × h + o × (o × h) and n = I l + o × I o + h × a with h = mass times centre of mass.
-    """
-    ux, uy, uz = oy * h[2] - oz * h[1], oz * h[0] - ox * h[2], ox * h[1] - oy * h[0]
-    fx = mass * ax + ly * h[2] - lz * h[1] + oy * uz - oz * uy
-    fy = mass * ay + lz * h[0] - lx * h[2] + oz * ux - ox * uz
-    fz = mass * az + lx * h[1] - ly * h[0] + ox * uy - oy * ux
-    jx = inertia[0, 0] * ox + inertia[0, 1] * oy + inertia[0, 2] * oz
-    jy = inertia[1, 0] * ox + inertia[1, 1] * oy + inertia[1, 2] * oz
-    jz = inertia[2, 0] * ox + inertia[2, 1] * oy + inertia[2, 2] * oz
-    nx = inertia[0, 0] * lx + inertia[0, 1] * ly + inertia[0, 2] * lz + oy * jz - oz * jy + h[1] * az - h[2] * ay
-    ny = inertia[1, 0] * lx + inertia[1, 1] * ly + inertia[1, 2] * lz + oz * jx - ox * jz + h[2] * ax - h[0] * az
-    nz = inertia[2, 0] * lx + inertia[2, 1] * ly + inertia[2, 2] * lz + ox * jy - oy * jx + h[0] * ay - h[1] * ax
-    return fx, fy, fz, nx, ny, nz
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _compose(R, p, turn, shift, out_R, out_p):
+    """(R, p) · (turn, shift) for samples of R (3, 3, M), p (3, M) and one fixed pose."""
+    for a in range(3):
+        x, y, z, origin = R[a, 0], R[a, 1], R[a, 2], p[a]
+        out = out_p[a]
+        for s in range(out.size):
+            out[s] = origin[s] + x[s] * shift[0] + y[s] * shift[1] + z[s] * shift[2]
+        for b in range(3):
+            out = out_R[a, b]
+            for s in range(out.size):
+                out[s] = x[s] * turn[0, b] + y[s] * turn[1, b] + z[s] * turn[2, b]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _newton_euler(cosine, sine, w, v, rotations, offsets, mass, first_moment, inertia, armature, gravity):
-    samples, n = cosine.shape
-    R, force = np.empty((n, 3, 3)), np.empty((n, 6))
-    torque, tip = np.empty((samples, n)), np.empty((samples, 9))
-    for s in range(samples):
-        ox = oy = oz = lx = ly = lz = 0.0
-        # Lifting the base with −g stands for gravity on every link.
-        ax, ay, az = -gravity[0], -gravity[1], -gravity[2]
-        for i in range(n):
-            c, d = cosine[s, i], sine[s, i]
-            E = R[i]
-            for a in range(3):
-                x, y = rotations[i, a, 0], rotations[i, a, 1]
-                E[a, 0], E[a, 1], E[a, 2] = c * x + d * y, c * y - d * x, rotations[i, a, 2]
-            # a + l × r + o × (o × r), the acceleration of this joint's origin in the parent's frame
-            rx, ry, rz = offsets[i, 0], offsets[i, 1], offsets[i, 2]
-            ux, uy, uz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx
-            bx = ax + ly * rz - lz * ry + oy * uz - oz * uy
-            by = ay + lz * rx - lx * rz + oz * ux - ox * uz
-            bz = az + lx * ry - ly * rx + ox * uy - oy * ux
-            ax = E[0, 0] * bx + E[1, 0] * by + E[2, 0] * bz
-            ay = E[0, 1] * bx + E[1, 1] * by + E[2, 1] * bz
-            az = E[0, 2] * bx + E[1, 2] * by + E[2, 2] * bz
-            tx = E[0, 0] * ox + E[1, 0] * oy + E[2, 0] * oz
-            ty = E[0, 1] * ox + E[1, 1] * oy + E[2, 1] * oz
-            tz = E[0, 2] * ox + E[1, 2] * oy + E[2, 2] * oz
-            rate = w[s, i]
-            mx = E[0, 0] * lx + E[1, 0] * ly + E[2, 0] * lz
-            my = E[0, 1] * lx + E[1, 1] * ly + E[2, 1] * lz
-            mz = E[0, 2] * lx + E[1, 2] * ly + E[2, 2] * lz
-            lx, ly, lz = mx + ty * rate, my - tx * rate, mz + v[s, i]
-            ox, oy, oz = tx, ty, tz + rate
-            f = _newton(mass[i], first_moment[i], inertia[i], ox, oy, oz, lx, ly, lz, ax, ay, az)
-            for a in range(6):
-                force[i, a] = f[a]
-        tip[s, 0], tip[s, 1], tip[s, 2] = ox, oy, oz
-        tip[s, 3], tip[s, 4], tip[s, 5] = lx, ly, lz
-        tip[s, 6], tip[s, 7], tip[s, 8] = ax, ay, az
-        for i in range(n - 1, -1, -1):
-            torque[s, i] = force[i, 5] + armature[i] * v[s, i]
-            if i > 0:
-                E, g = R[i], force[i]
-                fx = E[0, 0] * g[0] + E[0, 1] * g[1] + E[0, 2] * g[2]
-                fy = E[1, 0] * g[0] + E[1, 1] * g[1] + E[1, 2] * g[2]
-                fz = E[2, 0] * g[0] + E[2, 1] * g[1] + E[2, 2] * g[2]
-                rx, ry, rz = offsets[i, 0], offsets[i, 1], offsets[i, 2]
-                below = force[i - 1]
-                below[0] += fx
-                below[1] += fy
-                below[2] += fz
-                below[3] += E[0, 0] * g[3] + E[0, 1] * g[4] + E[0, 2] * g[5] + ry * fz - rz * fy
-                below[4] += E[1, 0] * g[3] + E[1, 1] * g[4] + E[1, 2] * g[5] + rz * fx - rx * fz
-                below[5] += E[2, 0] * g[3] + E[2, 1] * g[4] + E[2, 2] * g[5] + rx * fy - ry * fx
-    return torque, tip
+    n, samples = cosine.shape
+    E, wrench = np.empty((n, 3, 3, samples)), np.empty((n, 6, samples))
+    motion, moved = np.zeros((9, samples)), np.empty((9, samples))
+    # Lifting the base with −g stands for gravity on every link.
+    for a in range(3):
+        motion[6 + a] = -gravity[a]
+    for i in range(n):
+        for a in range(3):
+            x, y = rotations[i, a, 0], rotations[i, a, 1]
+            E[i, a, 2] = rotations[i, a, 2]
+            for s in range(samples):
+                E[i, a, 0, s] = cosine[i, s] * x + sine[i, s] * y
+                E[i, a, 1, s] = cosine[i, s] * y - sine[i, s] * x
+        _to_child(E[i], offsets[i], w[i], v[i], motion, moved)
+        motion, moved = moved, motion
+        _newton(mass[i], first_moment[i], inertia[i], motion, wrench[i])
+    torque = np.empty((n, samples))
+    for i in range(n - 1, -1, -1):
+        for s in range(samples):
+            torque[i, s] = wrench[i, 5, s] + armature[i] * v[i, s]
+        if i > 0:
+            _to_parent(E[i], offsets[i], wrench[i], wrench[i - 1])
+    return torque, motion
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _wrenches(motion, mass, first_moment, inertia):
-    out = np.empty((motion.shape[0], 6))
-    for s in range(motion.shape[0]):
-        m = motion[s]
-        f = _newton(mass, first_moment, inertia, m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8])
-        for a in range(6):
-            out[s, a] = f[a]
+def _to_child(E, offset, rate, acceleration, motion, out):
+    """Angular velocity o, angular acceleration l, acceleration a of the next link, each in its own frame.
+
+    o' = Eᵀ o + z ω,  l' = Eᵀ l + Eᵀ o × z ω + z v,  a' = Eᵀ (a + l × r + o × (o × r)).
+    """
+    rx, ry, rz = offset
+    for s in range(rate.size):
+        ox, oy, oz, lx, ly, lz = motion[0, s], motion[1, s], motion[2, s], motion[3, s], motion[4, s], motion[5, s]
+        ux, uy, uz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx
+        ax = motion[6, s] + ly * rz - lz * ry + oy * uz - oz * uy
+        ay = motion[7, s] + lz * rx - lx * rz + oz * ux - ox * uz
+        az = motion[8, s] + lx * ry - ly * rx + ox * uy - oy * ux
+        tx = E[0, 0, s] * ox + E[1, 0, s] * oy + E[2, 0, s] * oz
+        ty = E[0, 1, s] * ox + E[1, 1, s] * oy + E[2, 1, s] * oz
+        out[0, s], out[1, s] = tx, ty
+        out[2, s] = E[0, 2, s] * ox + E[1, 2, s] * oy + E[2, 2, s] * oz + rate[s]
+        out[3, s] = E[0, 0, s] * lx + E[1, 0, s] * ly + E[2, 0, s] * lz + ty * rate[s]
+        out[4, s] = E[0, 1, s] * lx + E[1, 1, s] * ly + E[2, 1, s] * lz - tx * rate[s]
+        out[5, s] = E[0, 2, s] * lx + E[1, 2, s] * ly + E[2, 2, s] * lz + acceleration[s]
+        out[6, s] = E[0, 0, s] * ax + E[1, 0, s] * ay + E[2, 0, s] * az
+        out[7, s] = E[0, 1, s] * ax + E[1, 1, s] * ay + E[2, 1, s] * az
+        out[8, s] = E[0, 2, s] * ax + E[1, 2, s] * ay + E[2, 2, s] * az
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _newton(mass, h, inertia, motion, out):
+    """Force and moment about the origin, for the motion (o, l, a) of a link with h = mass times centre of mass.
+
+    f = m a + l × h + o × (o × h),  n = I l + o × I o + h × a.
+    """
+    hx, hy, hz = h
+    xx, xy, xz, yy, yz, zz = inertia[0, 0], inertia[0, 1], inertia[0, 2], inertia[1, 1], inertia[1, 2], inertia[2, 2]
+    for s in range(motion.shape[1]):
+        ox, oy, oz, lx, ly, lz = motion[0, s], motion[1, s], motion[2, s], motion[3, s], motion[4, s], motion[5, s]
+        ax, ay, az = motion[6, s], motion[7, s], motion[8, s]
+        ux, uy, uz = oy * hz - oz * hy, oz * hx - ox * hz, ox * hy - oy * hx
+        out[0, s] = mass * ax + ly * hz - lz * hy + oy * uz - oz * uy
+        out[1, s] = mass * ay + lz * hx - lx * hz + oz * ux - ox * uz
+        out[2, s] = mass * az + lx * hy - ly * hx + ox * uy - oy * ux
+        jx, jy, jz = xx * ox + xy * oy + xz * oz, xy * ox + yy * oy + yz * oz, xz * ox + yz * oy + zz * oz
+        out[3, s] = xx * lx + xy * ly + xz * lz + oy * jz - oz * jy + hy * az - hz * ay
+        out[4, s] = xy * lx + yy * ly + yz * lz + oz * jx - ox * jz + hz * ax - hx * az
+        out[5, s] = xz * lx + yz * ly + zz * lz + ox * jy - oy * jx + hx * ay - hy * ax
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _to_parent(E, offset, wrench, out):
+    """Add a wrench about a joint's origin to that about its parent's: f += E f', n += E n' + r × E f'."""
+    rx, ry, rz = offset
+    for s in range(wrench.shape[1]):
+        gx, gy, gz, mx, my, mz = wrench[0, s], wrench[1, s], wrench[2, s], wrench[3, s], wrench[4, s], wrench[5, s]
+        fx = E[0, 0, s] * gx + E[0, 1, s] * gy + E[0, 2, s] * gz
+        fy = E[1, 0, s] * gx + E[1, 1, s] * gy + E[1, 2, s] * gz
+        fz = E[2, 0, s] * gx + E[2, 1, s] * gy + E[2, 2, s] * gz
+        out[0, s] += fx
+        out[1, s] += fy
+        out[2, s] += fz
+        out[3, s] += E[0, 0, s] * mx + E[0, 1, s] * my + E[0, 2, s] * mz + ry * fz - rz * fy
+        out[4, s] += E[1, 0, s] * mx + E[1, 1, s] * my + E[1, 2, s] * mz + rz * fx - rx * fz
+        out[5, s] += E[2, 0, s] * mx + E[2, 1, s] * my + E[2, 2, s] * mz + rx * fy - ry * fx
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _wrench(motion, mass, first_moment, inertia):
+    out = np.empty((6, motion.shape[1]))
+    _newton(mass, first_moment, inertia, motion, out)
     return out

@@ -80,54 +80,73 @@ def _along(axis: int, half: float) -> Array:
     return ends
 
 
-def tracks(R: Array, p: Array, R_view: Array, p_view: Array, capsules: Capsules) -> Tracks:
-    """How bodies move as seen from a frame that may move as well.
+def tracks(R: Array, p: Array, capsules: Capsules) -> Tracks:
+    """How bodies move in the frame in which the poses of their links are given.
 
     Args:
-        R: (S, L, 3, 3) rotations of the links.
-        p: (S, L, 3) their positions (m).
-        R_view: (S, 3, 3) rotations of the frame to look from.
-        p_view: (S, 3) its positions (m).
+        R: (L, 3, 3, S) rotations of the links.
+        p: (L, 3, S) their positions (m).
         capsules: The bodies.
     """
-    return Tracks(*_tracks(R, p, R_view, p_view, capsules.links, capsules.ends, capsules.radii))
+    return Tracks(*_tracks(R, p, capsules.links, capsules.ends, capsules.radii))
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _tracks(R, p, R_view, p_view, links, body_ends, radii):
-    samples, count, bodies = R.shape[0], R.shape[1], links.size
-    ends, travel = np.empty((bodies, 2, 3, samples)), np.empty((bodies, samples))
-    turn, last = np.empty((count, 3, 3)), np.empty((count, 3, 3))
-    shift, step = np.empty((count, 3)), np.zeros(count)
-    for s in range(samples):
-        V, o = R_view[s], p_view[s]
-        for k in range(count):
-            change = 0.0
-            dx, dy, dz = p[s, k, 0] - o[0], p[s, k, 1] - o[1], p[s, k, 2] - o[2]
+def seen_from(R_view, p_view, R, p):
+    """Poses of links (L, 3, 3, S), (L, 3, S) as seen from a frame that moves too, (3, 3, S), (3, S)."""
+    turned, shifted = np.empty(R.shape), np.empty(p.shape)
+    samples = p.shape[2]
+    for k in range(R.shape[0]):
+        for a in range(3):
+            x, y, z = R_view[0, a], R_view[1, a], R_view[2, a]
+            for s in range(samples):
+                shifted[k, a, s] = (
+                    x[s] * (p[k, 0, s] - p_view[0, s])
+                    + y[s] * (p[k, 1, s] - p_view[1, s])
+                    + z[s] * (p[k, 2, s] - p_view[2, s])
+                )
+            for b in range(3):
+                for s in range(samples):
+                    turned[k, a, b, s] = x[s] * R[k, 0, b, s] + y[s] * R[k, 1, b, s] + z[s] * R[k, 2, b, s]
+    return turned, shifted
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _tracks(R, p, links, body_ends, radii):
+    count, samples = R.shape[0], R.shape[3]
+    # 2 sin(θ/2) of the turn of a link since the sample before: its Frobenius norm over √2.
+    turn = np.zeros((count, samples))
+    for k in range(count):
+        for a in range(3):
+            for b in range(3):
+                _add_squared_steps(R[k, a, b], turn[k])
+        for s in range(samples):
+            turn[k, s] = np.sqrt(turn[k, s] / 2)
+    ends, travel, step = np.empty((links.size, 2, 3, samples)), np.zeros((links.size, samples)), np.empty((2, samples))
+    for i in range(links.size):
+        k = links[i]
+        step[:] = 0.0
+        for e in range(2):
+            t = body_ends[i, e]
             for a in range(3):
-                shift[k, a] = V[0, a] * dx + V[1, a] * dy + V[2, a] * dz
-                for b in range(3):
-                    x = V[0, a] * R[s, k, 0, b] + V[1, a] * R[s, k, 1, b] + V[2, a] * R[s, k, 2, b]
-                    change += (x - last[k, a, b]) ** 2
-                    last[k, a, b] = x
-                    turn[k, a, b] = x
-            # 2 sin(θ/2) of the turn since the last sample: its Frobenius norm over √2.
-            step[k] = np.sqrt(change / 2)
-        for i in range(bodies):
-            k = links[i]
-            farthest = 0.0
-            for e in range(2):
-                t = body_ends[i, e]
-                moved = 0.0
-                for a in range(3):
-                    x = shift[k, a] + turn[k, a, 0] * t[0] + turn[k, a, 1] * t[1] + turn[k, a, 2] * t[2]
-                    ends[i, e, a, s] = x
-                    if s > 0:
-                        moved += (x - ends[i, e, a, s - 1]) ** 2
-                farthest = max(farthest, moved)
-            # Displacement is affine in the point, so within the segment it is largest at an end.
-            travel[i, s] = travel[i, s - 1] + np.sqrt(farthest) + radii[i] * step[k] if s > 0 else 0.0
+                x, y, z, origin = R[k, a, 0], R[k, a, 1], R[k, a, 2], p[k, a]
+                row = ends[i, e, a]
+                for s in range(samples):
+                    row[s] = origin[s] + x[s] * t[0] + y[s] * t[1] + z[s] * t[2]
+                _add_squared_steps(row, step[e])
+        # Displacement is affine in the point, so within the segment it is largest at an end.
+        path = 0.0
+        for s in range(samples):
+            path += np.sqrt(max(step[0, s], step[1, s])) + radii[i] * turn[k, s]
+            travel[i, s] = path
     return ends, travel
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def _add_squared_steps(row, total):
+    """total[s] += (row[s] − row[s − 1])², from the second sample on."""
+    for s in range(1, row.size):
+        total[s] += (row[s] - row[s - 1]) ** 2
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -272,7 +291,7 @@ def box_heights(up, origin, low, high, start):
     """(P, S) height of the lowest corner of boxes (P, 3), (P, 3) in a frame; inf before sample `start`.
 
     Args:
-        up: (S, 3) the world's z axis in that frame.
+        up: (3, S) the world's z axis in that frame.
         origin: (S,) height of its origin (m).
         low: (P, 3) lower corners in that frame (m).
         high: (P, 3) upper corners (m).
@@ -283,7 +302,7 @@ def box_heights(up, origin, low, high, start):
         for s in range(start, origin.size):
             z = origin[s]
             for a in range(3):
-                z += min(up[s, a] * low[i, a], up[s, a] * high[i, a])
+                z += min(up[a, s] * low[i, a], up[a, s] * high[i, a])
             rows[i, s] = z
     return rows
 

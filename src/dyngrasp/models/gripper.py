@@ -167,9 +167,9 @@ class GripperModel:
     def grasp_point_many(self, q_h: Array) -> Array:
         """(K, 3) grasp points of the K postures q_h (K, m)."""
         q_h = np.atleast_2d(q_h)
-        q = np.tile(self.full_configuration(self.open_posture), (len(q_h), 1))
-        q[:, self.planned_indices] = q_h
-        return self._batch[0].poses(q, self._batch[1])[1].mean(axis=1)
+        q = np.tile(self.full_configuration(self.open_posture)[:, None], (1, len(q_h)))
+        q[self.planned_indices] = q_h.T
+        return self._batch[0].poses(q, self._batch[1])[1].mean(axis=0).T
 
     @cached_property
     def _batch(self) -> tuple[BatchModel, Attachments]:

@@ -1,8 +1,9 @@
-"""Whether a plan may be executed: every constraint evaluated anew, on a finer grid, by other means than the solver's.
+"""Whether a plan may be executed: every constraint evaluated anew, by other means than the solver's.
 
 The torques come from recursive Newton-Euler with its velocity terms (the planner uses symbolic M v + g and bounds), the
-funnel from the paper's formula as it stands, clearances from the collision geometry. All samples of a plan go through
-compiled loops at once: the audit is part of every cycle of replanning.
+funnel from the paper's formula as it stands, clearances from the collision geometry. The audit is part of every cycle
+of replanning: all samples of a plan go through compiled loops at once, and between two grid points it looks only where
+a constraint could be broken there.
 """
 
 from __future__ import annotations
@@ -13,20 +14,25 @@ from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from dyngrasp.models.assembly import Assembly, assemble
 from dyngrasp.models.batch_dynamics import Attachments, BatchModel, wrench_on
 from dyngrasp.models.kinematic_tree import frames_named
 from dyngrasp.models.pinch import pad_loads
-from dyngrasp.planning.clearance import clearance_entries
+from dyngrasp.planning.clearance import clearance_entries, waypoints_of
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry, AuditReport
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, Trajectory
 
-# Samples between neighbouring grid points: an acceleration that is linear in between peaks at the ends, a velocity
-# that is quadratic peaks once inside; four see it to a sixteenth of its height.
-SUBSTEPS = 4
+# Samples of an interval between two grid points in which a constraint could be broken: a velocity, quadratic in
+# between, is then seen to 1/256 of its height.
+SUBSTEPS = 16
+
+# A function of the motion departs from the chord between two grid points by about an eighth of its second difference
+# there. An interval is looked into where four times that could break a constraint.
+CURVATURE_FACTOR = 4.0 / 8.0
 
 # Rounding of a ratio to a limit after a solver that stops at 1e-8 in its own scaling.
 RATIO_TOLERANCE = 1e-6
@@ -40,7 +46,7 @@ CHORD_TOLERANCE = 5e-5
 
 @dataclass(frozen=True)
 class _Samples:
-    """A plan on the fine grid, phase after phase: times on its clock (M,), arm (M, n) and gripper (M, m) states.
+    """A plan at some times: on its clock (M,), arm (n, M) and gripper (m, M) states.
 
     `phases` are the three slices of M.
     """
@@ -54,30 +60,69 @@ class _Samples:
     w_h: Array
     v_h: Array
 
+    def arm(self, part: slice) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration of the arm in some of the samples."""
+        return tuple(np.ascontiguousarray(x[:, part]) for x in (self.q, self.w, self.v))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One constraint at the samples from `first` on: values (k, m) that must not exceed a bound, or not fall below.
+
+    `names` are those of the k values. `straight` says that between two grid points they are linear.
+    """
+
+    name: str
+    values: Array
+    first: int
+    bound: float
+    tolerance: float
+    unit: str
+    at_least: bool = False
+    names: tuple[str, ...] = ()
+    straight: bool = False
+
+    def entry(self, times: Array) -> AuditEntry:
+        """The worst value; `times` (M,) are those of all samples."""
+        # numpy's argmax and argmin stop at a NaN: it is the worst value there can be.
+        flat = int(self.values.argmin() if self.at_least else self.values.argmax())
+        which, k = divmod(flat, self.values.shape[1])
+        time, detail = float(times[self.first + k]), self.names[which] if self.names else ""
+        worst = float(self.values[which, k])
+        return AuditEntry(self.name, worst, self.bound, self.at_least, self.tolerance, self.unit, time, detail)
+
 
 class _Models:
     """What does not change from plan to plan: arrays of the arm empty and loaded, frames of flange and pads."""
 
     def __init__(self, task: GraspTask, grasp_name: str) -> None:
         grasp = next(grasp for grasp in task.grasp_object.grasps if grasp.name == grasp_name)
+        robot = task.robot
         self.empty = BatchModel.from_pinocchio(task.robot_empty.loaded_model)
         self.loaded = BatchModel.from_pinocchio(task.robot_loaded(grasp).loaded_model)
-        self.assembly: Assembly = assemble(task.robot, task.gripper)
+        self.assembly: Assembly = assemble(robot, task.gripper)
         self.tree = BatchModel.from_pinocchio(self.assembly.pin_model)
         pads = (frames_named(self.assembly.pin_model, name)[0] for name in task.gripper.pads)
         ids = [self.assembly.flange_id, *pads]
         frames = [self.assembly.pin_model.frames[i] for i in ids]
         placed = [(int(frame.parentJoint), pin.SE3(frame.placement)) for frame in frames]
         # The axes of the pinch are those of the hand; only its origin depends on the fingers.
-        hand = placed[0][1] * task.gripper.T_flange_hand * task.gripper.T_hand_grasp(task.gripper.open_posture)
+        hand = placed[0][1] * task.T_flange_open
         self.hand_frames: Attachments = self.tree.attach([(placed[0][0], hand), *placed[1:]])
+        held = self.loaded.attach([(robot.n, robot.T_last_flange * task.T_flange_closed(grasp))])
+        self.T_link_held = pin.SE3(held.rotations[0], held.positions[0])
+        self.held_body = (self.T_link_held * grasp.T_object_grasp.inverse()).act(task.grasp_object.spatial_inertia)
+        self.pinch = task.pinch(grasp)
 
     def hand(self, q: Array, q_h: Array) -> tuple[Array, Array]:
-        """The grasp frame as the hand holds it, in the world: rotations (M, 3, 3), positions of G (M, 3)."""
-        both = np.empty((len(q), self.tree.parents.size))
-        both[:, self.assembly.arm_indices], both[:, self.assembly.hand_indices] = q, q_h
+        """The grasp frame as the hand holds it, in the world: rotations (M, 3, 3), positions of G (M, 3).
+
+        For arm (n, M) and gripper (m, M) positions.
+        """
+        both = np.empty((self.tree.parents.size, q.shape[1]))
+        both[self.assembly.arm_indices], both[self.assembly.hand_indices] = q, q_h
         R, p = self.tree.poses(both, self.hand_frames)
-        return R[:, 0], (p[:, 1] + p[:, 2]) / 2
+        return np.moveaxis(R[0], -1, 0), (p[1] + p[2]).T / 2
 
 
 @lru_cache(maxsize=8)
@@ -99,72 +144,119 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float 
         executed.
     """
     models = _models(task, targets.grasp.name)
-    samples = _sample(plan, since)
-    approach, grasp, deliver = samples.phases
-    torques, _ = models.empty.inverse_dynamics(*(x[: grasp.stop] for x in (samples.q, samples.w, samples.v)))
-    loaded, motion = models.loaded.inverse_dynamics(*(x[deliver] for x in (samples.q, samples.w, samples.v)))
-    R, G = models.hand(samples.q[: grasp.stop], samples.q_h[: grasp.stop])
-    G, angles = _seen_from_grasp(R, G, samples.times[: grasp.stop], targets)
+    grid = _at_grid_points(plan, since)
+    rows = _rows(grid, plan, targets, task, models)
+    worst = [row.entry(grid.times) for row in rows]
+    between = _between(plan, grid, rows)
+    if between is not None:
+        inside = {row.name: row.entry(between.times) for row in _rows(between, plan, targets, task, models)}
+        worst = [_worse(entry, inside.get(entry.name, entry)) for entry in worst]
     entries = [
         _dynamics(plan),
         *_joins(plan),
         *_boundaries(plan, targets, task, models, since),
-        *_box_entries(samples, plan, task),
-        _at_most(
-            "torque",
-            np.abs(np.concatenate([torques, loaded])) / task.robot.limits.torque,
-            samples.times,
-            1.0,
-            RATIO_TOLERANCE,
-            "of limit",
-            plan.arm_joints,
-        ),
-        *_funnel(G[approach], samples.times[approach], task),
-        *_reversal(G[grasp], angles[grasp], samples.times[grasp], task),
-        _hold(motion, samples.times[deliver], targets, task, models),
-        *clearance_entries(
-            task,
-            targets,
-            {
-                name: (samples.times[part], samples.q[part], samples.q_h[part])
-                for name, part in zip(PHASE_NAMES, samples.phases, strict=True)
-            },
-        ),
+        *worst,
+        *clearance_entries(task, targets, waypoints_of(plan, since)),
     ]
     return AuditReport(tuple(entries))
 
 
-def _sample(plan: GraspPlan, since: float) -> _Samples:
+def _rows(samples: _Samples, plan: GraspPlan, targets: GraspTargets, task: GraspTask, models: _Models) -> list[_Row]:
+    """The constraints on every sample; those of a phase without samples are left out."""
+    approach, grasp, deliver = samples.phases
+    empty = slice(0, grasp.stop)
+    rows = _boxes(samples, plan, task)
+    torques = np.empty_like(samples.q)
+    torques[:, empty], _ = models.empty.inverse_dynamics(*samples.arm(empty))
+    torques[:, deliver], motion = models.loaded.inverse_dynamics(*samples.arm(deliver))
+    ratios = np.abs(torques) / task.robot.limits.torque[:, None]
+    rows.append(_Row("torque", ratios, 0, 1.0, RATIO_TOLERANCE, "of limit", names=plan.arm_joints))
+    if empty.stop:
+        R, G = models.hand(samples.q[:, empty], samples.q_h[:, empty])
+        G, angles = _seen_from_grasp(R, G, samples.times[empty], targets)
+        if approach.stop:
+            rows.append(_funnel(G[approach], task))
+        if grasp.stop > grasp.start:
+            rows += _reversal(G[grasp], angles[grasp], grasp.start, task)
+    if deliver.stop > deliver.start:
+        rows.append(_hold(motion, deliver.start, models))
+    return rows
+
+
+def _at_grid_points(plan: GraspPlan, since: float) -> _Samples:
+    """The plan on its grids, and at `since`; on the finer one where arm and gripper have different grids."""
+    chosen = []
+    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), strict=True):
+        local = arm.times if arm.intervals >= gripper.intervals else gripper.times
+        cut = since - (T - arm.duration)
+        if cut > 0.0:
+            local = np.concatenate([[cut], local[local > cut]]) if since < T else np.empty(0)
+        chosen.append(local)
+    return _sampled(plan, chosen)
+
+
+def _sampled(plan: GraspPlan, chosen: list[Array]) -> _Samples:
+    """The plan at times of each phase, counted from its beginning (s)."""
     tables, phases, end = [], [], 0
-    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends, strict=True):
-        count = SUBSTEPS * max(arm.intervals, gripper.intervals) + 1
-        local = np.linspace(max(since - (T - arm.duration), 0.0), arm.duration, count if since < T else 0)
-        tables.append((T - arm.duration + local, *arm.sample_many(local), *gripper.sample_many(local)))
+    for arm, gripper, T, local in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), chosen, strict=True):
+        tables.append((T - arm.duration + local, *_states(arm, local), *_states(gripper, local)))
         phases.append(slice(end, end + local.size))
         end += local.size
-    return _Samples(tuple(phases), *(np.concatenate(column) for column in zip(*tables, strict=True)))
+    return _Samples(
+        tuple(phases), *(np.ascontiguousarray(np.concatenate(column).T) for column in zip(*tables, strict=True))
+    )
 
 
-def _at_most(
-    name: str,
-    values: Array,
-    times: Array,
-    bound: float,
-    tolerance: float,
-    unit: str,
-    names: tuple[str, ...] | None = None,
-) -> AuditEntry:
-    """Entry for values (M,) or (M, k) that must not exceed `bound`; `names` are those of the k columns."""
-    # numpy's argmax and argmin stop at a NaN: it is the worst value there can be.
-    table = values.reshape(times.size, -1)
-    row, column = np.unravel_index(int(np.argmax(table)), table.shape)
-    detail = names[column] if names else ""
-    return AuditEntry(name, float(table[row, column]), bound, False, tolerance, unit, float(times[row]), detail)
+def _states(trajectory: Trajectory, local: Array) -> tuple[Array, Array, Array]:
+    """`Trajectory.sample_many`, for nothing where all grid points are asked for."""
+    if local.size == trajectory.intervals + 1 and local[0] == 0.0:
+        return trajectory.position, trajectory.velocity, trajectory.acceleration
+    return trajectory.sample_many(local)
 
 
-def _at_least(name: str, values: Array, times: Array, bound: float, tolerance: float, unit: str) -> AuditEntry:
-    row = int(np.argmin(values))
-    return AuditEntry(name, float(values[row]), bound, True, tolerance, unit, float(times[row]))
+def _between(plan: GraspPlan, grid: _Samples, rows: list[_Row]) -> _Samples | None:
+    """Samples inside the intervals in which a constraint could be broken; None if there is no such interval."""
+    suspects = np.zeros(grid.times.size, dtype=np.bool_)
+    for row in rows:
+        if not row.straight:
+            sign = -1.0 if row.at_least else 1.0
+            _mark_suspects(row.values, row.bound, sign, suspects[row.first : row.first + row.values.shape[1]])
+    for part in grid.phases:
+        # What follows the last sample of a phase is a join: no time passes there.
+        suspects[part.stop - 1 : part.stop] = False
+    if not suspects.any():
+        return None
+    chosen = []
+    for arm, T, part in zip(plan.arm, plan.phase_ends.tolist(), grid.phases, strict=True):
+        local = grid.times[part] - (T - arm.duration)
+        k = np.flatnonzero(suspects[part])
+        inside = local[k, None] + np.diff(local)[k, None] * (np.arange(1, SUBSTEPS) / SUBSTEPS)
+        chosen.append(inside.ravel())
+    return _sampled(plan, chosen)
+
+
+@njit(cache=True)
+def _mark_suspects(values, bound, sign, suspects):
+    """Mark the intervals between samples of values (k, m) in which the bound is not farther than they may bend."""
+    last = values.shape[1] - 1
+    for j in range(values.shape[0]):
+        row = values[j]
+        for k in range(last):
+            bend = 0.0
+            if k > 0:
+                bend = abs(row[k - 1] - 2.0 * row[k] + row[k + 1])
+            if k + 2 <= last:
+                bend = max(bend, abs(row[k] - 2.0 * row[k + 1] + row[k + 2]))
+            slack = min(sign * (bound - row[k]), sign * (bound - row[k + 1]))
+            # A NaN is suspect as well.
+            if not slack >= CURVATURE_FACTOR * bend:
+                suspects[k] = True
+
+
+def _worse(one: AuditEntry, other: AuditEntry) -> AuditEntry:
+    """The entry with the worse value, of one constraint; NaN is worst."""
+    sign = -1.0 if one.at_least else 1.0
+    return one if not sign * other.worst > sign * one.worst and not np.isnan(other.worst) else other
 
 
 def _dynamics(plan: GraspPlan) -> AuditEntry:
@@ -198,7 +290,7 @@ def _boundaries(
     """Where the hand really is at T_1, T_2, T_3, from the plan's joints alone, against where it was sent."""
     ends = [phase.position[-1] for phase in plan.arm]
     fingers = [phase.position[-1] for phase in plan.gripper]
-    R, G = models.hand(np.array([*ends, targets.place.position]), np.array([*fingers, targets.gripper_closed]))
+    R, G = models.hand(np.array([*ends, targets.place.position]).T, np.array([*fingers, targets.gripper_closed]).T)
     inside, angles = _seen_from_grasp(R[:2], G[:2], plan.phase_ends[:2], targets)
     above = np.array([0.0, 0.0, task.settings.pregrasp_distance])
     errors = (
@@ -241,63 +333,55 @@ def _angles(R: Array, other: Array) -> Array:
     return 2 * np.arcsin(np.minimum(chord, 1.0))
 
 
-def _box_entries(samples: _Samples, plan: GraspPlan, task: GraspTask) -> list[AuditEntry]:
+def _boxes(samples: _Samples, plan: GraspPlan, task: GraspTask) -> list[_Row]:
     """Positions, velocities and accelerations of arm and gripper as parts of their limits."""
     limits, gripper = task.robot.limits, task.gripper
     table = (
         ("position", _off_centre(samples.q, limits.position_lower, limits.position_upper), plan.arm_joints),
-        ("velocity", np.abs(samples.w) / limits.velocity, plan.arm_joints),
-        ("acceleration", np.abs(samples.v) / limits.acceleration, plan.arm_joints),
+        ("velocity", np.abs(samples.w) / limits.velocity[:, None], plan.arm_joints),
+        ("acceleration", np.abs(samples.v) / limits.acceleration[:, None], plan.arm_joints),
         ("gripper_position", _off_centre(samples.q_h, gripper.lower, gripper.upper), plan.gripper_joints),
-        ("gripper_velocity", np.abs(samples.w_h) / gripper.velocity, plan.gripper_joints),
-        ("gripper_acceleration", np.abs(samples.v_h) / gripper.acceleration, plan.gripper_joints),
+        ("gripper_velocity", np.abs(samples.w_h) / gripper.velocity[:, None], plan.gripper_joints),
+        ("gripper_acceleration", np.abs(samples.v_h) / gripper.acceleration[:, None], plan.gripper_joints),
     )
     return [
-        _at_most(name, values, samples.times, 1.0, RATIO_TOLERANCE, "of limit", names) for name, values, names in table
+        _Row(name, values, 0, 1.0, RATIO_TOLERANCE, "of limit", names=names, straight=name.endswith("acceleration"))
+        for name, values, names in table
     ]
 
 
 def _off_centre(q: Array, lower: Array, upper: Array) -> Array:
-    """Distance from the middle of the range over its half-width."""
-    return np.abs(q - (upper + lower) / 2) / ((upper - lower) / 2)
+    """Distance of q (n, M) from the middle of the range over its half-width."""
+    return np.abs(q - ((upper + lower) / 2)[:, None]) / ((upper - lower) / 2)[:, None]
 
 
-def _funnel(G: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
-    """h(q) of eq. (6): the height of G (M, 3) in the grasp frame above the inverted Gaussian of eq. (5)."""
-    if not times.size:
-        return []
+def _funnel(G: Array, task: GraspTask) -> _Row:
+    """h(q) of eq. (6): the height of G (m, 3) in the grasp frame above the inverted Gaussian of eq. (5)."""
     funnel = task.grasp_object.funnel
     x, y, z = G.T
     bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
-    return [_at_least("funnel", z - funnel.z_threshold * (1.0 - bell), times, 0.0, CHORD_TOLERANCE, "m")]
+    height = z - funnel.z_threshold * (1.0 - bell)
+    return _Row("funnel", height[None], 0, 0.0, CHORD_TOLERANCE, "m", at_least=True)
 
 
-def _reversal(G: Array, angles: Array, times: Array, task: GraspTask) -> list[AuditEntry]:
+def _reversal(G: Array, angles: Array, first: int, task: GraspTask) -> list[_Row]:
     """G stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes."""
-    if not times.size:
-        return []
-    settings = task.settings
-    lateral = np.hypot(G[:, 0], G[:, 1])
+    settings, (x, y, z) = task.settings, G.T
     return [
-        _at_most("grasp_axis", lateral, times, settings.lateral_tolerance, CHORD_TOLERANCE, "m"),
-        _at_least("grasp_dip", G[:, 2], times, -settings.dip_tolerance, CHORD_TOLERANCE, "m"),
-        _at_most("grasp_tilt", angles, times, settings.tilt_tolerance, 1e-4, "rad"),
+        _Row("grasp_axis", np.hypot(x, y)[None], first, settings.lateral_tolerance, CHORD_TOLERANCE, "m"),
+        _Row("grasp_dip", z[None], first, -settings.dip_tolerance, CHORD_TOLERANCE, "m", at_least=True),
+        _Row("grasp_tilt", angles[None], first, settings.tilt_tolerance, 1e-4, "rad"),
     ]
 
 
-def _hold(motion: Array, times: Array, targets: GraspTargets, task: GraspTask, models: _Models) -> AuditEntry:
+def _hold(motion: Array, first: int, models: _Models) -> _Row:
     """Share of its friction that the busier pad needs to carry the part, velocity terms included.
 
     The safety factor of the planner is not applied here: at 1 the part would just slip.
     """
-    robot = task.robot
-    in_flange = task.gripper.T_flange_hand * task.gripper.T_hand_grasp(targets.gripper_closed)
-    frame = models.loaded.attach([(robot.n, robot.T_last_flange * in_flange)])
-    T_link_grasp = pin.SE3(frame.rotations[0], frame.positions[0])
-    body = (T_link_grasp * targets.grasp.T_object_grasp.inverse()).act(task.grasp_object.spatial_inertia)
-    wrench = wrench_on(body, motion)
-    force = wrench[:, :3] @ T_link_grasp.rotation
-    moment = (wrench[:, 3:] - np.cross(T_link_grasp.translation, wrench[:, :3])) @ T_link_grasp.rotation
-    loads = pad_loads(force.T, moment.T, task.pinch(targets.grasp))
+    wrench, T = wrench_on(models.held_body, motion), models.T_link_held
+    force = T.rotation.T @ wrench[:3]
+    moment = T.rotation.T @ (wrench[3:] - pin.skew(T.translation) @ wrench[:3])
+    loads = pad_loads(force, moment, models.pinch)
     shares = [np.sqrt(load) / np.maximum(normal, 1e-9) for load, normal in loads]
-    return _at_most("hold", np.maximum(*shares), times, 1.0, RATIO_TOLERANCE, "of the grip")
+    return _Row("hold", np.maximum(*shares)[None], first, 1.0, RATIO_TOLERANCE, "of the grip")

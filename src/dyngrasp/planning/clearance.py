@@ -28,6 +28,7 @@ from dyngrasp.models.distance_bounds import (
     heights,
     near_boxes,
     near_capsules,
+    seen_from,
     tighten,
     tracks,
 )
@@ -35,6 +36,7 @@ from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry
 from dyngrasp.signals import Array, read_only
+from dyngrasp.trajectory import GraspPlan, Trajectory
 
 Indices = NDArray[np.intp]
 
@@ -53,6 +55,20 @@ RESOLUTION = 1e-6
 
 # Joints between two bodies below which they cannot meet, or always touch.
 APART = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints:
+    """Where a plan is looked at: times (S,) on its clock, arm (n, S) and gripper (m, S) positions.
+
+    From sample `closing` on the pads may touch the part, from `lifted` on it hangs in the gripper.
+    """
+
+    times: Array
+    q: Array
+    q_h: Array
+    closing: int
+    lifted: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +146,9 @@ class CellGeometry:
         self.self_pairs = first.astype(np.int64), second.astype(np.int64)
 
     def poses(self, q: Array, q_h: Array) -> tuple[Array, Array]:
-        """Poses of all links (world first) and the flange (last): (S, L, 3, 3), (S, L, 3)."""
-        both = np.empty((len(q), self.tree.parents.size))
-        both[:, self.assembly.arm_indices], both[:, self.assembly.hand_indices] = q, q_h
+        """Poses of all links (world first) and the flange (last): (L, 3, 3, S), (L, 3, S), for (n, S), (m, S)."""
+        both = np.empty((self.tree.parents.size, q.shape[1]))
+        both[self.assembly.arm_indices], both[self.assembly.hand_indices] = q, q_h
         return self.tree.poses(both, self.frames)
 
     def nearest(self, pairs: Candidates, scene: Scene) -> tuple[float, int, str]:
@@ -165,15 +181,15 @@ class CellGeometry:
     def _at(self, i: int, scene: Scene, k: int) -> coal.Transform3s:
         if i < len(self.links):
             link = self.links[i]
-            return coal.Transform3s(scene.R[k, link], scene.p[k, link]) * self.placements[i]
+            return coal.Transform3s(scene.R[link, :, :, k], scene.p[link, :, k]) * self.placements[i]
         if i == self.ground:
             return coal.Transform3s()
-        return coal.Transform3s(scene.R_part[k], scene.p_part[k])
+        return coal.Transform3s(scene.R_part[:, :, k], scene.p_part[:, k])
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Poses at S samples: links (S, L, 3, 3), (S, L, 3) and part (S, 3, 3), (S, 3), which is carried from `lifted` on.
+    """Poses at S samples: links (L, 3, 3, S), (L, 3, S) and part (3, 3, S), (3, S), which is carried from `lifted` on.
 
     `closing` is the first sample at which the pads may touch the part.
     """
@@ -203,36 +219,26 @@ def cell_geometry(task: GraspTask, grasp_name: str) -> CellGeometry:
     return CellGeometry(task, next(g for g in task.grasp_object.grasps if g.name == grasp_name))
 
 
-def clearance_entries(
-    task: GraspTask, targets: GraspTargets, motion: dict[str, tuple[Array, Array, Array]]
-) -> list[AuditEntry]:
+def clearance_entries(task: GraspTask, targets: GraspTargets, waypoints: Waypoints) -> list[AuditEntry]:
     """Least distances along a plan: to the ground, to the part outside the intended contact, of the arm to itself.
 
     Args:
         task: Arm, gripper and part.
         targets: Where the part stands and how it is taken.
-        motion: For the phases "approach", "grasp" and "deliver" times (M,) on the plan's clock, arm (M, n) and gripper
-            (M, m) positions.
+        waypoints: Samples of the plan, from `waypoints_of`.
 
     Returns:
         Entries "ground_clearance", "part_clearance", "self_clearance" and, for the carried part against ground and
         arm, "carried_clearance"; distances above `HORIZON` are reported as `HORIZON`.
     """
     cell = cell_geometry(task, targets.grasp.name)
-    phases = [motion[name] for name in ("approach", "grasp", "deliver")]
-    chosen = [_spread(np.hstack([q, q_h])) for _, q, q_h in phases]
-    times, q, q_h = (
-        np.concatenate([phase[column][k] for phase, k in zip(phases, chosen, strict=True)]) for column in range(3)
-    )
-    closing = chosen[0].size
-    scene = _scene(cell, q, q_h, targets.part_poses(times), closing, closing + chosen[1].size)
+    scene = _scene(cell, waypoints, targets)
     # Comparisons would lose a NaN on the way to the least distance.
-    numbers = (scene.R, scene.p, scene.R_part, scene.p_part, *(x for phase in phases for x in phase))
-    if not all(np.isfinite(x).all() for x in numbers):
+    if not all(np.isfinite(x.sum()) for x in (waypoints.times, scene.R, scene.p, scene.R_part, scene.p_part)):
         found = dict.fromkeys(_CHECKS, (np.nan, 0, "a motion that is not finite"))
     else:
-        world = tracks(scene.R, scene.p, np.tile(np.eye(3), (len(q), 1, 1)), np.zeros((len(q), 3)), cell.capsules)
-        seen = tracks(scene.R, scene.p, scene.R_part, scene.p_part, cell.capsules)
+        world = tracks(scene.R, scene.p, cell.capsules)
+        seen = tracks(*seen_from(scene.R_part, scene.p_part, scene.R, scene.p), cell.capsules)
         candidates = (
             _over_ground(cell, world),
             _near_part(cell, scene, seen),
@@ -245,7 +251,7 @@ def clearance_entries(
         found["carried_clearance"] = distance, max(k, scene.lifted), who
     bounds = dict.fromkeys(_CHECKS, 0.0) | {"carried_clearance": -_sunk(task, targets)}
     return [
-        AuditEntry(name, distance, bounds[name], True, _CHECKS[name], "m", float(times[k]), who)
+        AuditEntry(name, distance, bounds[name], True, _CHECKS[name], "m", float(waypoints.times[k]), who)
         for name, (distance, k, who) in found.items()
     ]
 
@@ -265,13 +271,16 @@ _CHECKS = {
 }
 
 
-def _scene(cell: CellGeometry, q: Array, q_h: Array, standing: tuple[Array, Array], closing: int, lifted: int) -> Scene:
-    R, p = cell.poses(q, q_h)
-    R_part, p_part = standing[0].copy(), standing[1].copy()
-    T = cell.T_flange_object
-    R_part[lifted:] = R[lifted:, -1] @ T.rotation
-    p_part[lifted:] = p[lifted:, -1] + R[lifted:, -1] @ T.translation
-    return Scene(R, p, R_part, p_part, closing, lifted)
+def _scene(cell: CellGeometry, waypoints: Waypoints, targets: GraspTargets) -> Scene:
+    R, p = cell.poses(waypoints.q, waypoints.q_h)
+    lifted, T = waypoints.lifted, cell.T_flange_object
+    R_part, p_part = np.empty(R.shape[1:]), np.empty(p.shape[1:])
+    standing = targets.part_poses(waypoints.times[:lifted])
+    R_part[..., :lifted], p_part[..., :lifted] = np.moveaxis(standing[0], 0, -1), standing[1].T
+    R_flange, p_flange = R[-1, :, :, lifted:], p[-1, :, lifted:]
+    R_part[..., lifted:] = np.einsum("abs,bc->acs", R_flange, T.rotation)
+    p_part[..., lifted:] = p_flange + np.einsum("abs,b->as", R_flange, T.translation)
+    return Scene(R, p, R_part, p_part, waypoints.closing, lifted)
 
 
 def _over_ground(cell: CellGeometry, world: Tracks) -> Candidates:
@@ -281,7 +290,7 @@ def _over_ground(cell: CellGeometry, world: Tracks) -> Candidates:
 
 def _near_part(cell: CellGeometry, scene: Scene, seen: Tracks) -> Candidates:
     """Arm and hand against the pieces; the pads only until they close."""
-    samples = len(scene.R)
+    samples = scene.p.shape[2]
     stops = np.where(cell.is_pad[cell.moving], scene.closing, samples)
     return _to_pieces(cell, seen, cell.moving, np.zeros_like(stops), stops)
 
@@ -302,11 +311,10 @@ def _within_arm(cell: CellGeometry, world: Tracks) -> Candidates:
 
 def _carried(cell: CellGeometry, scene: Scene, seen: Tracks) -> Candidates:
     """The pieces of the part against arm, base and ground, once it is lifted."""
-    bodies, samples = cell.arm_and_base, len(scene.R)
+    bodies, samples = cell.arm_and_base, scene.p.shape[2]
     starts, stops = np.full(bodies.size, scene.lifted), np.full(bodies.size, samples)
     arm = _to_pieces(cell, seen, bodies, starts, stops)
-    up, origin = np.ascontiguousarray(scene.R_part[:, 2]), np.ascontiguousarray(scene.p_part[:, 2])
-    bounds = box_heights(up, origin, cell.low, cell.high, scene.lifted)
+    bounds = box_heights(scene.R_part[2], scene.p_part[2], cell.low, cell.high, scene.lifted)
     pieces = np.arange(len(cell.low)) + len(cell.links)
     # A height above the ground is bounded well enough at every sample by itself.
     apart: Array = np.tile(np.arange(samples) * 1e9, (pieces.size, 1)).astype(float)
@@ -318,18 +326,45 @@ def _carried(cell: CellGeometry, scene: Scene, seen: Tracks) -> Candidates:
     )
 
 
+def waypoints_of(plan: GraspPlan, since: float = -np.inf) -> Waypoints:
+    """Samples of a plan from `since` (s) on, `JOINT_STEP` or less apart, with both ends of each phase."""
+    tables, counts = [], []
+    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), strict=True):
+        start = since - (T - arm.duration)
+        local = _equidistant(arm, gripper, max(start, 0.0)) if since < T else np.empty(0)
+        tables.append((T - arm.duration + local, arm.sample_many(local)[0], gripper.sample_many(local)[0]))
+        counts.append(local.size)
+    times, q, q_h = (np.concatenate(column) for column in zip(*tables, strict=True))
+    return Waypoints(times, np.ascontiguousarray(q.T), np.ascontiguousarray(q_h.T), counts[0], counts[0] + counts[1])
+
+
+def _equidistant(arm: Trajectory, gripper: Trajectory, start: float) -> Array:
+    """Times of a phase, from `start` (s) to its end, between which no joint moves by more than `JOINT_STEP`."""
+    finer = max(arm.intervals, gripper.intervals)
+    grid = arm.times if arm.intervals == finer else gripper.times
+    both = [x.position if x.intervals == finer else x.sample_many(grid)[0] for x in (arm, gripper)]
+    path = _path(both[0]) + _path(both[1])
+    if not np.isfinite(path[-1]):
+        return grid[grid >= start]
+    # Where both stand still the path has no slope and times could not be read from it.
+    path += 1e-9 * np.arange(path.size)
+    begin = float(np.interp(start, grid, path))
+    count = max(int(np.ceil((path[-1] - begin) / JOINT_STEP)), 1)
+    times = np.interp(np.linspace(begin, path[-1], count + 1), path, grid)
+    times[0] = start
+    return times
+
+
 @njit(cache=True)
-def _spread(q: Array) -> Indices:
-    """Indices of samples of q (M, n), first and last included, `JOINT_STEP` apart or less if the samples allow it."""
-    chosen = np.empty(q.shape[0], np.int64)
-    if q.shape[0] == 0:
-        return chosen
-    chosen[0], used = 0, 1
+def _path(q):
+    """Sum (M,) of the largest joint steps from sample to sample of q (M, n) (rad)."""
+    path = np.zeros(q.shape[0])
     for k in range(1, q.shape[0]):
-        keep = k == q.shape[0] - 1
+        largest = 0.0
         for i in range(q.shape[1]):
-            keep = keep or abs(q[k + 1, i] - q[chosen[used - 1], i]) > JOINT_STEP
-        if keep:
-            chosen[used] = k
-            used += 1
-    return chosen[:used]
+            step = abs(q[k, i] - q[k - 1, i])
+            # A NaN, once found, stays.
+            if not step <= largest and largest == largest:
+                largest = step
+        path[k] = path[k - 1] + largest
+    return path
