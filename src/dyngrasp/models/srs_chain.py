@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.signals import Array, read_only
@@ -36,7 +37,7 @@ from dyngrasp.signals import Array, read_only
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["BRANCHES", "ROUNDING", "ElbowCircle", "SrsChain", "joint_vector"]
+__all__ = ["BRANCHES", "ROUNDING", "ElbowCircle", "SrsChain", "configurations", "joint_vector"]
 
 BRANCHES = 8
 VERTICAL = 1e-9
@@ -120,12 +121,8 @@ class SrsChain:
 
     def arm_angle(self, q: ArrayLike) -> float:
         """Arm angle ψ (rad, in (−π, π]) of a configuration q (7,) (rad); the module states the convention."""
-        q = joint_vector(q)
-        u, elbow_axis = self._shoulder_to_wrist(q)
-        # Joint 4's axis instead of the elbow's offset from S–W: it keeps its direction where the offset vanishes.
-        h = np.cross(u, elbow_axis) if q[3] < 0.0 else np.cross(elbow_axis, u)
-        e, g = _reference_directions(*u)
-        return math.atan2(h @ g, h @ e)
+        _, a, b, _ = self.lengths
+        return _arm_angle(joint_vector(q), a, b)
 
     def null_space_rate(self, q: ArrayLike) -> Array:
         """Joint rates dq/dψ (7,) that turn the elbow about S–W at 1 rad/s and keep the flange where it is.
@@ -136,7 +133,7 @@ class SrsChain:
         """
         q = joint_vector(q)
         _, a, b, _ = self.lengths
-        u, _ = self._shoulder_to_wrist(q)
+        u, _ = _shoulder_to_wrist(q, a, b)
         shoulder, k_s = _euler_rates(q[0], q[1], u)
         L = self.reach(q[3])
         if L < _ALIGNED:
@@ -162,65 +159,15 @@ class SrsChain:
             InvalidProblem: A pose that is not finite.
         """
         R, p = T_world_flange.rotation, T_world_flange.translation
-        if not (np.isfinite(R).all() and np.isfinite(p).all()):
-            raise InvalidProblem("the flange pose holds a number that is not finite")
-        base, a, b, tool = self.lengths
-        wx, wy, wz = (float(v) for v in p - tool * R[:, 2])
-        wz -= base
-        L = math.sqrt(wx * wx + wy * wy + wz * wz)
+        elbow, rotations, L = _circle(R, p, self.lengths, nearest, farthest)
         excess = max(L - farthest, nearest - L)
+        if not math.isfinite(L):
+            raise InvalidProblem("the flange pose holds a number that is not finite")
         if excess > ROUNDING or L < _ALIGNED:
             how = "farther than the arm reaches" if farthest < L else "nearer than the elbow can fold"
             where = f"the wrist centre would be {L:.6g} m from the shoulder, {max(excess, 0.0):.3g} m {how}"
             raise OutOfReach("the flange pose", max(excess, 0.0), where)
-        u = np.array([wx / L, wy / L, wz / L])
-        L = min(max(L, nearest), farthest)
-        # The half-angle form keeps its precision near the straight and the folded elbow; acos loses half the digits.
-        elbow = 2.0 * math.atan2(
-            math.sqrt(max((a + b - L) * (a + b + L), 0.0)), math.sqrt(max((L - abs(a - b)) * (L + abs(a - b)), 0.0))
-        )
-        if elbow < STRAIGHT:
-            elbow = 0.0
-        s4, c4 = math.sin(elbow), math.cos(elbow)
-        sin_alpha, cos_alpha = b * s4 / L, (a + b * c4) / L
-        e, g = _reference_directions(*u)
-        # Elbow direction h = cos ψ e + sin ψ g; columns of R03 for q4 ≥ 0: x = cos α h − sin α u, y = u × h,
-        # z = cos α u + sin α h, with α the angle at the shoulder between S–W and the upper arm.
-        R03 = np.zeros((3, 3, 3))
-        for k, (h, u_cross_h) in enumerate(((e, g), (g, -e))):
-            R03[k, :, 0], R03[k, :, 1], R03[k, :, 2] = cos_alpha * h, u_cross_h, sin_alpha * h
-        R03[2, :, 0], R03[2, :, 2] = -sin_alpha * u, cos_alpha * u
-        R34 = np.array([[c4, 0.0, -s4], [0.0, 1.0, 0.0], [s4, 0.0, c4]])
-        R47 = np.swapaxes(R03 @ R34, 1, 2) @ R
-        return ElbowCircle(elbow, np.concatenate([R03.reshape(3, 9), R47.reshape(3, 9)], axis=1))
-
-    def configurations(self, circle: ElbowCircle, psi: Array, branches: int | NDArray[np.int64] | None = None) -> Array:
-        """Joint angles (rad, whole turns arbitrary) at arm angles psi (m,).
-
-        (m, 7) on the given branch of each arm angle, or (m, 8, 7) on all branches.
-        """
-        m = psi.size
-        weights = np.empty((m, 3))
-        weights[:, 0], weights[:, 1], weights[:, 2] = np.cos(psi), np.sin(psi), 1.0
-        # Shoulder and wrist in one sweep.
-        angles, aligned = _zyz_angles((weights @ circle.rotations).reshape(m, 2, 9))
-        first = np.empty((m, 7))
-        first[:, :3], first[:, 3], first[:, 4:] = angles[:, 0], circle.elbow, angles[:, 1]
-        every = branches is None
-        q = first[:, None] * _SIGNS + _TURNS if every else first * _SIGNS[branches] + _TURNS[branches]
-        if aligned.any():
-            _share_turns(q, angles, aligned)
-        return q
-
-    def _shoulder_to_wrist(self, q: Array) -> tuple[Array, Array]:
-        """Unit vector u from S to W and the y axis of the upper arm (opposite to joint 4's axis), both in the base."""
-        _, a, b, _ = self.lengths
-        (c1, c2, c3), (s1, s2, s3) = np.cos(q[:3]), np.sin(q[:3])
-        x3 = np.array([c1 * c2 * c3 - s1 * s3, s1 * c2 * c3 + c1 * s3, -s2 * c3])
-        y3 = np.array([-c1 * c2 * s3 - s1 * c3, -s1 * c2 * s3 + c1 * c3, s2 * s3])
-        z3 = np.array([c1 * s2, s1 * s2, c2])
-        w = -b * math.sin(q[3]) * x3 + (a + b * math.cos(q[3])) * z3
-        return w / max(float(np.linalg.norm(w)), _ALIGNED), y3
+        return ElbowCircle(elbow, rotations)
 
 
 def joint_vector(q: ArrayLike) -> Array:
@@ -231,39 +178,127 @@ def joint_vector(q: ArrayLike) -> Array:
     return q
 
 
-def _reference_directions(ux: float, uy: float, uz: float) -> tuple[Array, Array]:
+def configurations(circle: ElbowCircle, psi: Array, branches: NDArray[np.int64]) -> Array:
+    """Joint angles (m, b, 7) (rad, whole turns arbitrary) at arm angles psi (m,) on some branches (m, b) of each."""
+    return _configurations(circle.elbow, circle.rotations, psi, branches, _SIGNS, _TURNS)
+
+
+@njit(cache=True, error_model="numpy")
+def _shoulder_to_wrist(q, a, b):
+    """Unit vector u from S to W and the y axis of the upper arm (opposite to joint 4's axis), both in the base."""
+    c1, c2, c3, s1, s2, s3 = np.cos(q[0]), np.cos(q[1]), np.cos(q[2]), np.sin(q[0]), np.sin(q[1]), np.sin(q[2])
+    x = np.array([c1 * c2 * c3 - s1 * s3, s1 * c2 * c3 + c1 * s3, -s2 * c3])
+    y = np.array([-c1 * c2 * s3 - s1 * c3, -s1 * c2 * s3 + c1 * c3, s2 * s3])
+    z = np.array([c1 * s2, s1 * s2, c2])
+    w = -b * np.sin(q[3]) * x + (a + b * np.cos(q[3])) * z
+    return w / max(np.sqrt((w**2).sum()), _ALIGNED), y
+
+
+@njit(cache=True, error_model="numpy")
+def _arm_angle(q, a, b):
+    u, y = _shoulder_to_wrist(q, a, b)
+    # Joint 4's axis instead of the elbow's offset from S–W: it keeps its direction where the offset vanishes.
+    h = np.array([y[1] * u[2] - y[2] * u[1], y[2] * u[0] - y[0] * u[2], y[0] * u[1] - y[1] * u[0]])
+    if q[3] < 0.0:
+        h = -h
+    e, g = _reference_directions(u)
+    return np.arctan2((h * g).sum(), (h * e).sum())
+
+
+@njit(cache=True, error_model="numpy")
+def _reference_directions(u):
     """Reference direction e of the arm angle for S–W along u, and g = u × e."""
-    level = math.hypot(ux, uy)
+    level = np.hypot(u[0], u[1])
     if level < VERTICAL:
         # To first order in the tilt of u: exact in double precision below VERTICAL.
-        return np.array([1.0, 0.0, -ux * uz]), np.array([0.0, uz, -uy])
-    cx, cy = ux / level, uy / level
-    return np.array([-uz * cx, -uz * cy, level]), np.array([cy, -cx, 0.0])
+        return np.array([1.0, 0.0, -u[0] * u[2]]), np.array([0.0, u[2], -u[1]])
+    cx, cy = u[0] / level, u[1] / level
+    return np.array([-u[2] * cx, -u[2] * cy, level]), np.array([cy, -cx, 0.0])
 
 
-def _zyz_angles(R: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Angles (..., 3) of R = Rz Ry Rz, the middle one in [0, π], and where it is 0 or π; R (..., 9) row-major.
+@njit(cache=True, error_model="numpy")
+def _circle(R, p, lengths, nearest, farthest):
+    """`ElbowCircle.elbow` and `.rotations` for a flange pose with S–W brought into its bounds, and S–W as it is."""
+    base, a, b, tool = lengths
+    wrist = np.array([p[0] - tool * R[0, 2], p[1] - tool * R[1, 2], p[2] - tool * R[2, 2] - base])
+    true_L = np.sqrt((wrist**2).sum())
+    u = wrist / true_L
+    L = min(max(true_L, nearest), farthest)
+    # The half-angle form keeps its precision near the straight and the folded elbow; acos loses half the digits.
+    elbow = 2.0 * np.arctan2(
+        np.sqrt(max((a + b - L) * (a + b + L), 0.0)), np.sqrt(max((L - abs(a - b)) * (L + abs(a - b)), 0.0))
+    )
+    if elbow < STRAIGHT:
+        elbow = 0.0
+    s4, c4 = np.sin(elbow), np.cos(elbow)
+    sin_alpha, cos_alpha = b * s4 / L, (a + b * c4) / L
+    e, g = _reference_directions(u)
+    # Elbow direction h = cos ψ e + sin ψ g; columns of R03 for q4 ≥ 0: x = cos α h − sin α u, y = u × h,
+    # z = cos α u + sin α h, with α the angle at the shoulder between S–W and the upper arm.
+    R03 = np.zeros((3, 3, 3))
+    for i in range(3):
+        R03[0, i, 0], R03[0, i, 1], R03[0, i, 2] = cos_alpha * e[i], g[i], sin_alpha * e[i]
+        R03[1, i, 0], R03[1, i, 1], R03[1, i, 2] = cos_alpha * g[i], -e[i], sin_alpha * g[i]
+        R03[2, i, 0], R03[2, i, 2] = -sin_alpha * u[i], cos_alpha * u[i]
+    R34 = ((c4, 0.0, -s4), (0.0, 1.0, 0.0), (s4, 0.0, c4))
+    rotations = np.empty((3, 18))
+    for k in range(3):
+        for i in range(3):
+            for j in range(3):
+                rotations[k, 3 * i + j] = R03[k, i, j]
+                # R47 = (R03 R34)ᵀ R
+                total = 0.0
+                for m in range(3):
+                    for n in range(3):
+                        total += R34[n][i] * R03[k, m, n] * R[m, j]
+                rotations[k, 9 + 3 * i + j] = total
+    return elbow, rotations, true_L
+
+
+@njit(cache=True, error_model="numpy")
+def _configurations(elbow, rotations, psi, branches, signs, turns):
+    out = np.empty((psi.size, branches.shape[1], 7))
+    R, first = np.empty(18), np.empty(7)
+    for m in range(psi.size):
+        c, s = np.cos(psi[m]), np.sin(psi[m])
+        for j in range(18):
+            R[j] = c * rotations[0, j] + s * rotations[1, j] + rotations[2, j]
+        shoulder, wrist = _zyz_angles(R[:9], first[:3]), _zyz_angles(R[9:], first[4:])
+        first[3] = elbow
+        for k in range(branches.shape[1]):
+            q, branch = out[m, k], branches[m, k]
+            for i in range(7):
+                q[i] = first[i] * signs[branch, i] + turns[branch, i]
+            if shoulder:
+                _share_turn(q[:3], first[1])
+            if wrist:
+                _share_turn(q[4:], first[5])
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _zyz_angles(R, out):
+    """Angles (3,) of R = Rz Ry Rz, row-major (9,), the middle one in [0, π]; returns whether that is 0 or π.
 
     There the first angle is zero and the third takes all of the turn.
     """
-    tilt = np.hypot(R[..., 2], R[..., 5])
+    tilt = np.hypot(R[2], R[5])
     aligned = tilt < _ALIGNED
-    first = np.where(aligned, 0.0, np.arctan2(R[..., 5], R[..., 2]))
-    c, s = np.cos(first), np.sin(first)
-    # From the upper two rows instead of the last one, which vanishes with the tilt.
-    third = np.arctan2(c * R[..., 3] - s * R[..., 0], c * R[..., 4] - s * R[..., 1])
-    return np.stack([first, np.arctan2(tilt, R[..., 8]), third], axis=-1), aligned
+    first = 0.0 if aligned else np.arctan2(R[5], R[2])
+    # cos and sin of the first angle. From the upper two rows instead of the last one, which vanishes with the tilt.
+    c, s = (1.0, 0.0) if aligned else (R[2] / tilt, R[5] / tilt)
+    out[0], out[1] = first, np.arctan2(tilt, R[8])
+    out[2] = np.arctan2(c * R[3] - s * R[0], c * R[4] - s * R[1])
+    return aligned
 
 
-def _share_turns(q: Array, angles: Array, aligned: NDArray[np.bool_]) -> None:
-    """Let the neighbours of an aligned joint share their turn equally, in place; q (m, 7) or (m, 8, 7)."""
-    for part, (first, third) in enumerate(((0, 2), (4, 6))):
-        rows = np.nonzero(aligned[:, part])[0]
-        # At 0 the two neighbours add up, at π they subtract.
-        sign = np.where(angles[rows, part, 1] > 0.5 * math.pi, -1.0, 1.0).reshape(-1, *[1] * (q.ndim - 2))
-        turn = q[rows, ..., third] + sign * q[rows, ..., first]
-        turn -= 2.0 * math.pi * np.rint(turn / (2.0 * math.pi))
-        q[rows, ..., first], q[rows, ..., third] = 0.5 * sign * turn, 0.5 * turn
+@njit(cache=True, error_model="numpy")
+def _share_turn(q, middle):
+    """Let the neighbours of an aligned joint share their turn equally, in place; at 0 they add up, at π subtract."""
+    sign = -1.0 if middle > 0.5 * np.pi else 1.0
+    turn = q[2] + sign * q[0]
+    turn -= 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))
+    q[0], q[2] = 0.5 * sign * turn, 0.5 * turn
 
 
 def _euler_rates(first: float, middle: float, omega: Array) -> tuple[Array, float]:

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from dyngrasp.errors import InvalidProblem, ModelFileError, OutOfReach
-from dyngrasp.models.srs_chain import BRANCHES, ROUNDING, ElbowCircle, SrsChain, joint_vector
+from dyngrasp.models.srs_chain import BRANCHES, ROUNDING, ElbowCircle, SrsChain, configurations, joint_vector
 from dyngrasp.signals import Array, read_only
 
 if TYPE_CHECKING:
@@ -147,9 +148,9 @@ class SrsKinematics:
             raise InvalidProblem(f"branch {branch}: an S-R-S arm has branches 0 to {BRANCHES - 1}")
         if not math.isfinite(arm_angle):
             raise InvalidProblem(f"arm angle {arm_angle}: a finite number expected")
-        q, within = self._configurations(self._circle(T_world_flange), np.array([arm_angle]), branch)
-        q = q[0]
-        if not within[0]:
+        q, within = self._configurations(self._circle(T_world_flange), np.array([arm_angle]), np.array([[branch]]))
+        q = q[0, 0]
+        if not within[0, 0]:
             lower, upper = self.limits.position_lower, self.limits.position_upper
             worst = int(np.argmax(np.maximum(lower - q, q - upper)))
             raise OutOfReach(
@@ -173,7 +174,7 @@ class SrsKinematics:
             InvalidProblem: A pose that is not finite.
         """
         grid = _grid(arm_angles) if isinstance(arm_angles, int) else np.atleast_1d(np.asarray(arm_angles, dtype=float))
-        q, within = self._configurations(self._circle(T_world_flange), grid)
+        q, within = self._configurations(self._circle(T_world_flange), grid, _every_branch(grid.size))
         at, branches = np.nonzero(within)
         if at.size == 0:
             raise self._forbidden(grid.size)
@@ -204,7 +205,11 @@ class SrsKinematics:
         if branch not in range(BRANCHES):
             raise InvalidProblem(f"branch {branch}: an S-R-S arm has branches 0 to {BRANCHES - 1}")
         circle, grid = self._circle(T_world_flange), _grid(samples)
-        inside = self._configurations(circle, grid, branch)[1]
+
+        def admissible(psi: Array) -> NDArray[np.bool_]:
+            return self._configurations(circle, psi, np.full((psi.size, 1), branch))[1][:, 0]
+
+        inside = admissible(grid)
         if inside.all():
             return [(-math.pi, math.pi)]
         step = 2.0 * math.pi / samples
@@ -212,7 +217,7 @@ class SrsKinematics:
         good, bad = grid[edges] + step * ~inside[edges], grid[edges] + step * inside[edges]
         while edges.size and np.abs(good - bad).max() > 1e-12:
             middle = 0.5 * (good + bad)
-            keeps = self._configurations(circle, middle, branch)[1]
+            keeps = admissible(middle)
             good, bad = np.where(keeps, middle, good), np.where(keeps, bad, middle)
         starts, ends = good[~inside[edges]], good[inside[edges]]
         if starts.size and ends[0] < starts[0]:
@@ -242,15 +247,15 @@ class SrsKinematics:
         circle = self._circle(T_world_flange)
         weight = 1.0 / np.asarray(self.limits.velocity)
 
-        def evaluate(psi: Array, branches: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
+        def evaluate(psi: Array, branches: NDArray[np.int64]) -> tuple[Array, Array]:
             q, within = self._configurations(circle, psi, branches)
-            return q, np.where(within, (((q - q_reference) * weight) ** 2).sum(axis=-1), np.inf)
+            return q, _weighted_squares(q, within, q_reference, weight)
 
         own = self.arm_angle(q_reference)
         # Intervals narrower than the grid are rare; only where nothing else is left is the finer grid worth its time.
         for size in (ARM_ANGLES, 20 * ARM_ANGLES):
             grid, step = own + _grid(size), 2.0 * math.pi / size
-            q, cost = evaluate(grid)
+            q, cost = evaluate(grid, _every_branch(size))
             if np.isfinite(cost).any():
                 break
         else:
@@ -261,10 +266,10 @@ class SrsKinematics:
         at, branch = at[first], branch[first]
         rows = np.arange(at.size)
         psi, best_q, best = grid[at], q[at, branch], cost[at, branch]
-        offsets = np.linspace(-1.0, 1.0, 65)
+        offsets = np.linspace(-1.0, 1.0, 17)
         while step > 1e-9:
             trial = psi[:, None] + step * offsets
-            q, cost = evaluate(trial.ravel(), np.repeat(branch, offsets.size))
+            q, cost = evaluate(trial.ravel(), np.repeat(branch, offsets.size)[:, None])
             q, cost = q.reshape(*trial.shape, 7), cost.reshape(trial.shape)
             pick = cost.argmin(axis=1)
             better = cost[rows, pick] < best
@@ -276,7 +281,7 @@ class SrsKinematics:
                 wins = best <= 1.05 * best.min() + 1e-9
                 psi, branch, best_q, best = psi[wins], branch[wins], best_q[wins], best[wins]
                 rows = np.arange(best.size)
-            step /= 25.0  # wider than the spacing of 1/32: noise near the minimum cannot push it out of the next window
+            step /= 6.0  # wider than the spacing of 1/8: noise near the minimum cannot push it out of the next window
         return best_q[best.argmin()]
 
     def _forbidden(self, count: int) -> OutOfReach:
@@ -287,14 +292,48 @@ class SrsKinematics:
         return self._chain.circle(T_world_flange, *self._reach)
 
     def _configurations(
-        self, circle: ElbowCircle, psi: Array, branches: int | NDArray[np.int64] | None = None
+        self, circle: ElbowCircle, psi: Array, branches: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """`SrsChain.configurations` turned to the middle of the ranges, and whether each keeps the limits."""
-        q = self._chain.configurations(circle, psi, branches)
-        q -= 2.0 * math.pi * np.rint((q - self._middle) / (2.0 * math.pi))
-        clipped = np.clip(q, self.limits.position_lower, self.limits.position_upper)
-        within = np.asarray((np.abs(q - clipped) <= ROUNDING).all(axis=-1))
-        return np.where(within[..., None], clipped, q), within
+        """`srs_chain.configurations` turned to the middle of the ranges, and whether each keeps the limits, (m, b)."""
+        q = configurations(circle, psi, branches)
+        limits = self.limits
+        return q, _turned_within(q, self._middle, limits.position_lower, limits.position_upper)
+
+
+@njit(cache=True, error_model="numpy")
+def _turned_within(q, middle, lower, upper):
+    """Turn joints (m, b, 7) by whole turns to the middle of their ranges, in place; whether all are in their ranges.
+
+    What is outside by rounding is put on the edge.
+    """
+    within = np.ones(q.shape[:2], dtype=np.bool_)
+    for m in range(q.shape[0]):
+        for k in range(q.shape[1]):
+            for i in range(7):
+                x = q[m, k, i] - 2.0 * np.pi * np.rint((q[m, k, i] - middle[i]) / (2.0 * np.pi))
+                edge = min(max(x, lower[i]), upper[i])
+                within[m, k] = within[m, k] and abs(x - edge) <= ROUNDING
+                q[m, k, i] = edge if abs(x - edge) <= ROUNDING else x
+    return within
+
+
+@njit(cache=True, error_model="numpy")
+def _weighted_squares(q, within, reference, weight):
+    """Σ ((q − reference) · weight)² of configurations (m, b, 7), inf where a limit is broken."""
+    cost = np.full(within.shape, np.inf)
+    for m in range(q.shape[0]):
+        for k in range(q.shape[1]):
+            if within[m, k]:
+                total = 0.0
+                for i in range(7):
+                    total += ((q[m, k, i] - reference[i]) * weight[i]) ** 2
+                cost[m, k] = total
+    return cost
+
+
+def _every_branch(count: int) -> NDArray[np.int64]:
+    """All branches, (count, 8)."""
+    return np.broadcast_to(np.arange(BRANCHES), (count, BRANCHES)).copy()
 
 
 def _grid(count: int) -> Array:
