@@ -1,4 +1,4 @@
-"""The command line: `dyngrasp run | plan | study | bench | models | check`."""
+"""The command line: `dyngrasp run | plan | study | perceive | bench | models | check`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ COMMANDS = {
     "run": ("dyngrasp.cli.run", "run"),
     "plan": ("dyngrasp.cli.run", "plan"),
     "study": ("dyngrasp.cli.study", "study"),
+    "perceive": ("dyngrasp.cli.perceive", "perceive_folder"),
     "bench": ("dyngrasp.cli.bench", "bench"),
     "models": ("dyngrasp.cli.inspect", "models"),
     "check": ("dyngrasp.cli.inspect", "check"),

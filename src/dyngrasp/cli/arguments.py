@@ -84,6 +84,16 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     study.add_argument("--json", metavar="FILE", help="write the rows also as JSON, with machine and versions")
     study.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
 
+    perceive = commands.add_parser("perceive", help="find the part in a folder of pictures")
+    perceive.add_argument("scenario", metavar="SCENARIO", help=f"{_SCENARIO}; names arm, hand, part and camera")
+    perceive.add_argument(
+        "folder",
+        metavar="FOLDER",
+        help="pictures and frames.csv with times and joint angles, as `dyngrasp run` keeps them",
+    )
+    perceive.add_argument("--out", metavar="FILE", default="poses.csv", help="where the poses go; default: poses.csv")
+    perceive.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
+
     bench = commands.add_parser("bench", help="measure how long planning takes")
     benchmarks = bench.add_subparsers(dest="benchmark", required=True, metavar="WHAT")
     bench_plan = benchmarks.add_parser("plan", help="whole plans and their phases, against other solvers")

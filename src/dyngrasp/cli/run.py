@@ -13,11 +13,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dyngrasp.cli.arguments import DELIVERED, NOT_DELIVERED
+from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.errors import RenderingUnavailable
 from dyngrasp.experiments.draws import Trial, draw_trial
 from dyngrasp.experiments.output import OutputFolder, atomic, check_writable, write_json
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.experiments.trial import ExecutedTrial, PlannedTrial, execute_trial, plan_trial, planner_for, summary
+from dyngrasp.experiments.vision_files import write_pictures
 from dyngrasp.experiments.workcell import Workcell, load_workcell
 from dyngrasp.report.summary import run_table
 
@@ -112,9 +114,22 @@ def _write(
         return
     with atomic(out / "record.npz") as temporary:
         executed.record.save(temporary)
+    if executed.vision is not None:
+        _vision(console, executed.vision, out)
     _figure(workcell, planned, executed, document, out)
     if video and workcell.scenario.render.video:
         _video(console, workcell, executed, out)
+
+
+def _vision(console: Console, vision: VisionRecord, out: OutputFolder) -> None:
+    with atomic(out / "vision.npz") as temporary:
+        vision.save(temporary)
+    words = f"detections and estimates of {len(vision.reports)} pictures in {escape(str(out / 'vision.npz'))}"
+    if vision.pictures:
+        folder = OutputFolder(out / "pictures")
+        size = write_pictures(vision, folder)
+        words += f", {len(vision.pictures)} of the pictures in {escape(str(folder.path))} ({1e-6 * size:.1f} MB)"
+    console.print(words)
 
 
 def _figure(
@@ -131,11 +146,13 @@ def _figure(
 
 
 def _video(console: Console, workcell: Workcell, executed: ExecutedTrial, out: OutputFolder) -> None:
+    from dyngrasp.report.camera_inset import CameraInset
     from dyngrasp.report.video import write_video
     from dyngrasp.simulation.rendering import Renderer
 
     render, record = workcell.scenario.render, executed.record
     times = np.arange(record.t[0], record.t[-1], 1.0 / render.frames_per_second)
+    inset = None if executed.vision is None else CameraInset(executed.vision, render.width)
     try:
         with (
             Renderer(executed.scene, width=render.width, height=render.height) as renderer,
@@ -145,7 +162,8 @@ def _video(console: Console, workcell: Workcell, executed: ExecutedTrial, out: O
             def frames() -> Iterator[np.ndarray]:
                 for i, t in enumerate(times):
                     advance(i, "video")
-                    yield renderer.frame(record.scene_state[record.index_at(t)])
+                    frame = renderer.frame(record.scene_state[record.index_at(t)])
+                    yield frame if inset is None else inset.over(frame, t)
 
             write_video(out / "episode.mp4", frames(), render.frames_per_second)
     except RenderingUnavailable as error:

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.closed_loop.camera_poses import CameraPoses, CameraPosesSettings
+from dyngrasp.closed_loop.recorded_poses import RecordedPoses
 from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.scenario import Scenario
@@ -107,6 +108,23 @@ def tracker_settings(scenario: Scenario) -> PartTrackerSettings:
     turn = np.deg2rad(section.mount_deg)
     shared = (np.hypot(1e-3 * section.mount_mm, turn * _VIEWING_DISTANCE) + 2e-4, turn + np.deg2rad(0.05))
     return PartTrackerSettings(filter=replace(pose_filter, shared_error=(float(shared[0]), float(shared[1]))))
+
+
+def recorded_poses(
+    workcell: Workcell, vision: VisionRecord, settings: PartTrackerSettings | None = None
+) -> RecordedPoses:
+    """A source that replays what a run saw.
+
+    Args:
+        workcell: Arm, hand and part of that run.
+        vision: Its record; camera and prior are taken from there.
+        settings: Of the tracker; the scenario's if left out, which give the run's own estimates.
+    """
+    task = workcell.task
+    solver = MarkerPoseSolver(vision.camera, task.grasp_object)
+    settings = settings or tracker_settings(workcell.scenario)
+    tracker = PartTracker(solver, task.robot, task.gripper, vision.prior, settings)
+    return RecordedPoses(tracker, vision.frames)
 
 
 def vision_summary(vision: VisionRecord | None) -> dict[str, Any]:
