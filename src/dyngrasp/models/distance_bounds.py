@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 from dyngrasp.signals import Array
 
+# A path this short (m) is none: far below what any of the distances is known to.
+STILL = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
@@ -161,6 +164,19 @@ def _box_gap(ends, s, low, high):
     return np.sqrt(gap) if gap > 0.0 else -np.inf
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _first_beyond(travel, start, stop, reach):
+    """First sample from `start` on, or `stop`, at which a path (S,), which never shrinks, exceeds `reach`."""
+    low, high = start, stop
+    while low < high:
+        middle = (low + high) // 2
+        if travel[middle] <= reach:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @njit(cache=True, error_model="numpy")
 def near_boxes(ends, travel, radii, bodies, starts, stops, low, high, horizon):
     """Pairs of a body and a box that may come nearer than `horizon`, and lower bounds for them.
@@ -189,33 +205,28 @@ def near_boxes(ends, travel, radii, bodies, starts, stops, low, high, horizon):
     for n in range(bodies.size):
         b = bodies[n]
         comes_near = False
-        s = starts[n]
+        s = begin = starts[n]
         while s < stops[n] and not comes_near:
             room = _box_gap(ends[b], s, around_low, around_high) - radii[b] - horizon
             comes_near = not room >= 0.0
-            reach = travel[b, s] + room
-            s += 1
-            while s < stops[n] and travel[b, s] <= reach:
-                s += 1
+            begin = s
+            s = _first_beyond(travel[b], s + 1, stops[n], travel[b, s] + room)
         if not comes_near:
             continue
-        begin = s - 1
         for i in range(count):
             row = rows[used]
-            row[:] = np.inf
             keep = False
             s = begin
             while s < stops[n]:
                 bound = _box_gap(ends[b], s, low[i], high[i]) - radii[b]
                 if bound < horizon:
+                    if not keep:
+                        row[:] = np.inf
                     row[s] = bound
                     keep = True
-                    s += 1
-                else:
-                    reach = travel[b, s] + bound - horizon
-                    s += 1
-                    while s < stops[n] and travel[b, s] <= reach:
-                        s += 1
+                # While the body stays where it is, so does its distance.
+                room = max(bound - horizon, STILL)
+                s = _first_beyond(travel[b], s + 1, stops[n], travel[b, s] + room)
             if keep:
                 first[used], second[used] = b, i
                 used += 1
@@ -226,26 +237,24 @@ def near_boxes(ends, travel, radii, bodies, starts, stops, low, high, horizon):
 def near_capsules(ends, travel, radii, first, second, horizon):
     """Pairs of bodies (K,), (K,) that may come nearer to each other than `horizon`; as `near_boxes`."""
     samples = travel.shape[1]
-    rows = np.empty((first.size, samples))
+    rows, path = np.empty((first.size, samples)), np.empty(samples)
     kept = np.empty(first.size, np.int64)
     used = 0
     for n in range(first.size):
         i, k = first[n], second[n]
         row = rows[used]
-        row[:] = np.inf
         keep = False
+        for s in range(samples):
+            path[s] = travel[i, s] + travel[k, s]
         s = 0
         while s < samples:
             bound = _segment_distance(ends[i], ends[k], s) - radii[i] - radii[k]
             if bound < horizon:
+                if not keep:
+                    row[:] = np.inf
                 row[s] = bound
                 keep = True
-                s += 1
-            else:
-                reach = travel[i, s] + travel[k, s] + bound - horizon
-                s += 1
-                while s < samples and travel[i, s] + travel[k, s] <= reach:
-                    s += 1
+            s = _first_beyond(path, s + 1, samples, path[s] + max(bound - horizon, STILL))
         if keep:
             kept[used] = n
             used += 1

@@ -42,7 +42,7 @@ Indices = NDArray[np.intp]
 
 # Distances above this (m) are not measured: the audit asks for contact, not for the exact width of a gap that nobody
 # would call narrow.
-HORIZON = 0.10
+HORIZON = 0.05
 
 # The hand moves at most this far (rad of any joint) between two samples: about a centimetre at the finger tips.
 JOINT_STEP = 0.015
@@ -343,28 +343,36 @@ def _equidistant(arm: Trajectory, gripper: Trajectory, start: float) -> Array:
     finer = max(arm.intervals, gripper.intervals)
     grid = arm.times if arm.intervals == finer else gripper.times
     both = [x.position if x.intervals == finer else x.sample_many(grid)[0] for x in (arm, gripper)]
-    path = _path(both[0]) + _path(both[1])
-    if not np.isfinite(path[-1]):
+    return _times_along(grid, *both, start, JOINT_STEP)
+
+
+@njit(cache=True)
+def _times_along(grid, q, q_h, start, joint_step):
+    """Times from `start` to the last of `grid` (M,), equidistant on the path of q (M, n) and q_h (M, m).
+
+    The path counts in the largest joint step of each interval (rad).
+    """
+    last = grid.size - 1
+    path = np.zeros(grid.size)
+    for k in range(last):
+        # Where both stand still the path needs a slope too, for times to be read from it.
+        path[k + 1] = path[k] + _largest_step(q, k) + _largest_step(q_h, k) + 1e-9
+    if not np.isfinite(path[last]):
+        # A number that is none is looked at.
         return grid[grid >= start]
-    # Where both stand still the path has no slope and times could not be read from it.
-    path += 1e-9 * np.arange(path.size)
-    begin = float(np.interp(start, grid, path))
-    count = max(int(np.ceil((path[-1] - begin) / JOINT_STEP)), 1)
-    times = np.interp(np.linspace(begin, path[-1], count + 1), path, grid)
-    times[0] = start
+    begin = np.interp(start, grid, path)
+    count = max(int(np.ceil((path[last] - begin) / joint_step)), 1)
+    times = np.interp(begin + (path[last] - begin) / count * np.arange(count + 1), path, grid)
+    times[0], times[count] = start, grid[last]
     return times
 
 
 @njit(cache=True)
-def _path(q):
-    """Sum (M,) of the largest joint steps from sample to sample of q (M, n) (rad)."""
-    path = np.zeros(q.shape[0])
-    for k in range(1, q.shape[0]):
-        largest = 0.0
-        for i in range(q.shape[1]):
-            step = abs(q[k, i] - q[k - 1, i])
-            # A NaN, once found, stays.
-            if not step <= largest and largest == largest:
-                largest = step
-        path[k] = path[k - 1] + largest
-    return path
+def _largest_step(q, k):
+    largest = 0.0
+    for i in range(q.shape[1]):
+        step = abs(q[k + 1, i] - q[k, i])
+        # A NaN, once found, stays.
+        if not step <= largest and largest == largest:
+            largest = step
+    return largest
