@@ -10,7 +10,7 @@ from rich.table import Table
 
 from dyngrasp.cli.arguments import DELIVERED
 from dyngrasp.experiments.bench_plan import CASES, PEERS, PlanBenchmark, bench_plan
-from dyngrasp.experiments.bench_replan import bench_replan
+from dyngrasp.experiments.bench_replan import MOVES, bench_replan
 from dyngrasp.experiments.output import check_writable, write_json
 from dyngrasp.experiments.provenance import machine, versions
 
@@ -83,11 +83,13 @@ def _replan(options: argparse.Namespace) -> int:
     with console.status("…") as status:
         rows = bench_replan(options.cycles, options.seed, options.rho, against, status.update)
     programs = [row for row in rows if row["case"].startswith("qp_")]
-    cycles = [row for row in rows if row["solver"] == "replanner"]
+    late = [row for row in rows if row["case"] == "late_moves"]
+    cycles = [row for row in rows if row["solver"] == "replanner" and row["case"] != "late_moves"]
     errors = [row for row in rows if row["case"] == "end_point_error"]
     for title, shown, columns in (
         ("Quadratic program, ms", programs, ("case", "solver", "n", "solved", *_TIMES)),
         ("Whole cycle, ms", cycles, ("case", "n", *_TIMES, "published", "kept", "late", "published_invalid", "jumps")),
+        ("Share of moves followed, by the rest of the approach", late, ("left_s", "n", *(f"{mm}_mm" for mm in MOVES))),
         ("Miss at the pre-grasp", errors, ("solver", "duration_weight", "move", "error_mm")),
     ):
         console.print(_table(title, shown, columns))
@@ -132,6 +134,10 @@ def _text(name: str, value: Any) -> str:
         return value
     if name.endswith("_ms"):
         return f"{value:.3f}" if value < 1 else f"{value:.2f}"
+    if name == "left_s":
+        return f"{value:.2f} s"
+    if name.endswith("_mm") and name != "error_mm":
+        return f"{100 * value:.0f} %"
     if name == "error_mm":
         return f"{value:.2g}"
     if name == "objective":

@@ -35,6 +35,10 @@ _WEIGHTS = TrackingWeights(0.1, 0.1, 1.0, 100.0)
 # With the speed limits at this share of what the motion asks, some sixty rows of the program are active.
 _ACTIVE_SHARE = 0.985
 
+# What is left of the approach at a late move (s), and how far the part moves (mm); it turns by up to 1° for 4 mm.
+LEFT = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35, 0.25, 0.15)
+MOVES = (2, 5, 10, 20, 30)
+
 SEQUENCES = ("still", "drift", "step_3cm", "step_5cm", "moving")
 
 
@@ -90,6 +94,8 @@ def bench_replan(
             # General solvers take up to a thousand times longer; a few dozen calls tell their median.
             rows.append(_peer_row(case, name, problems[: min(cycles, 40)]))
     rows += _cycle_rows(cell, cycles, seed, progress)
+    progress("moves late in the approach")
+    rows += late_move_rows(cell, max(cycles // 100, 4), seed)
     progress("end point errors of the two updates")
     rows += end_point_rows(cell, seed)
     return [row | {"rho": effort_weight} for row in rows]
@@ -202,6 +208,29 @@ def _cycle_rows(cell: Cell, cycles: int, seed: int, progress: Callable[[str], No
         {"solver": "replanner", "case": case, **timing_summary(times), **outcome[case]}
         for case, times in counted.items()
     ]
+
+
+def late_move_rows(cell: Cell, count: int, seed: int) -> list[dict[str, Any]]:
+    """How many single moves of the part are followed, by what is left of the approach and by the size of the move."""
+    replanner = Replanner(cell.task, None, StructuredSolver(), cell.planner)
+    rng = np.random.default_rng([seed, 2])
+    plan, T = cell.plan, cell.targets.T_world_object
+    rows: list[dict[str, Any]] = []
+    for left in LEFT:
+        t = float(plan.phase_ends[APPROACH]) - left
+        accepted = []
+        for millimetres in MOVES:
+            ok = 0
+            for _ in range(count):
+                heading, turn = rng.uniform(-np.pi, np.pi), np.deg2rad(millimetres / 4 * rng.uniform(-1.0, 1.0))
+                offset = 1e-3 * millimetres * np.array([np.cos(heading), np.sin(heading), 0.0])
+                T_new = pin.SE3(pin.utils.rotate("z", turn) @ T.rotation, T.translation + offset)
+                estimate = PoseEstimate(T_new, 1e-6 * np.eye(6), t, t, np.zeros(6))
+                ok += replanner.replan_to_pose(plan, cell.targets, estimate, t).ok
+            accepted.append(ok)
+        shares = {f"{millimetres}_mm": k / count for millimetres, k in zip(MOVES, accepted, strict=True)}
+        rows.append({"solver": "replanner", "case": "late_moves", "left_s": left, "n": count, **shares})
+    return rows
 
 
 def _case_of(result: ReplanResult) -> str:

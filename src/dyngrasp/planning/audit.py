@@ -9,6 +9,7 @@ a constraint could be broken there.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -130,7 +131,13 @@ def _models(task: GraspTask, grasp_name: str) -> _Models:
     return _Models(task, grasp_name)
 
 
-def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float = -np.inf) -> AuditReport:
+def audit(
+    plan: GraspPlan,
+    targets: GraspTargets,
+    task: GraspTask,
+    since: float = -np.inf,
+    wall: Callable[[Array], Array] = np.ones_like,
+) -> AuditReport:
     """Evaluate every constraint of a plan.
 
     Args:
@@ -138,6 +145,8 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float 
         targets: The boundary states and the grasp that it was made for.
         task: Arm, gripper, part and settings.
         since: What comes before this time (s) is past and not looked at; before the end of the plan.
+        wall: What part of its height the wall of the funnel has at times (M,) (s): all of it, but where a motion begins
+            outside.
 
     Returns:
         One entry a constraint, each with the worst value, its bound and its time. A plan that fails one must not be
@@ -145,11 +154,12 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float 
     """
     models = _models(task, targets.grasp.name)
     grid = _at_grid_points(plan, since)
-    rows = _rows(grid, plan, targets, task, models)
+    rows = _rows(grid, plan, targets, task, models, wall)
     worst = [row.entry(grid.times) for row in rows]
     between = _between(plan, grid, rows)
     if between is not None:
-        inside = {row.name: row.entry(between.times) for row in _rows(between, plan, targets, task, models)}
+        finer = _rows(between, plan, targets, task, models, wall)
+        inside = {row.name: row.entry(between.times) for row in finer}
         worst = [_worse(entry, inside.get(entry.name, entry)) for entry in worst]
     entries = [
         _dynamics(plan),
@@ -161,7 +171,14 @@ def audit(plan: GraspPlan, targets: GraspTargets, task: GraspTask, since: float 
     return AuditReport(tuple(entries))
 
 
-def _rows(samples: _Samples, plan: GraspPlan, targets: GraspTargets, task: GraspTask, models: _Models) -> list[_Row]:
+def _rows(
+    samples: _Samples,
+    plan: GraspPlan,
+    targets: GraspTargets,
+    task: GraspTask,
+    models: _Models,
+    wall: Callable[[Array], Array],
+) -> list[_Row]:
     """The constraints on every sample; those of a phase without samples are left out."""
     approach, grasp, deliver = samples.phases
     empty = slice(0, grasp.stop)
@@ -175,7 +192,7 @@ def _rows(samples: _Samples, plan: GraspPlan, targets: GraspTargets, task: Grasp
         R, G = models.hand(samples.q[:, empty], samples.q_h[:, empty])
         G, angles = _seen_from_grasp(R, G, samples.times[empty], targets)
         if approach.stop:
-            rows.append(_funnel(G[approach], task))
+            rows.append(_funnel(G[approach], wall(samples.times[approach]), task))
         if grasp.stop > grasp.start:
             rows += _reversal(G[grasp], angles[grasp], grasp.start, task)
     if deliver.stop > deliver.start:
@@ -355,12 +372,12 @@ def _off_centre(q: Array, lower: Array, upper: Array) -> Array:
     return np.abs(q - ((upper + lower) / 2)[:, None]) / ((upper - lower) / 2)[:, None]
 
 
-def _funnel(G: Array, task: GraspTask) -> _Row:
-    """h(q) of eq. (6): the height of G (m, 3) in the grasp frame above the inverted Gaussian of eq. (5)."""
+def _funnel(G: Array, wall: Array, task: GraspTask) -> _Row:
+    """h(q) of eq. (6): how high G (m, 3) is in the grasp frame above the inverted Gaussian of eq. (5) times `wall`."""
     funnel = task.grasp_object.funnel
     x, y, z = G.T
     bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
-    height = z - funnel.z_threshold * (1.0 - bell)
+    height = z - wall * funnel.z_threshold * (1.0 - bell)
     return _Row("funnel", height[None], 0, 0.0, CHORD_TOLERANCE, "m", at_least=True)
 
 

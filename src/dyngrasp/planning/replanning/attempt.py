@@ -90,8 +90,7 @@ class Attempt:
             return self._kept(Status.INFEASIBLE, targets, refusal)
         phase = self.plan.phase_at(self.splice)
         if phase == APPROACH:
-            share = self.settings.recovery_share
-            self.recovery = funnel_recovery(self.state, targets, self.task, self.splice, share)
+            self.recovery = self._recovery(self.splice, targets)
             if self.recovery is None:
                 return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
         status, candidate, best = Status.INFEASIBLE, None, None
@@ -115,9 +114,9 @@ class Attempt:
             if not _about_the_approach(self.report, best):
                 break
         if best is not None and self.full is not None and phase == APPROACH:
-            found = self._reoptimised(best, targets)
+            found, path = self._reoptimised(best, targets)
             if found is not None:
-                return self._published(found, targets, Path.REOPTIMISED, self.settings.budget)
+                return self._published(found, targets, path, self.settings.budget)
         return self._fresh_or_kept(targets, estimate, "", status)
 
     def _refusal(self) -> str:
@@ -146,16 +145,21 @@ class Attempt:
         self._count("tracking", started)
         return candidate
 
+    def _recovery(self, splice: float, targets: GraspTargets) -> FunnelRecovery | None:
+        shares, reaction = self.settings.recovery_shares, self.settings.reaction
+        return funnel_recovery(self.plan, splice, targets, self.task, shares, reaction)
+
     def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
         started = time.perf_counter()
-        report = audit(plan, targets, self.task, self.splice)
-        if self.recovery is not None and plan.start_time == self.splice:
-            report = self.recovery.judge(report, plan, targets, self.task)
+        if self.recovery is None:
+            report = audit(plan, targets, self.task, self.splice)
+        else:
+            report = audit(plan, targets, self.task, self.splice, self.recovery.wall(plan))
         self._count("audit", started)
         return report
 
-    def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> GraspPlan | None:
-        """Solve the phases that the audit refuses under all constraints; None if that does not help."""
+    def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> tuple[GraspPlan | None, Path]:
+        """The way down the funnel anew, then under all constraints; None if neither helps."""
         assert self.full is not None
         assert self.report is not None
         assert self.recovery is not None
@@ -166,8 +170,17 @@ class Attempt:
         self._count("full", started)
         if problems is None:
             self.reasons.append(f"full problem: {why}")
-            return None
-        return self._refined(candidate, set(), problems, state, targets, self.settings.budget)
+            return None, Path.REOPTIMISED
+        started = time.perf_counter()
+        anew = self.full.descent(candidate, problems[APPROACH], state, targets)
+        self._count("descent", started)
+        if anew is not None:
+            self.report = self._audited(anew, targets)
+            if self.report.ok:
+                return anew, Path.DESCENT
+            self.reasons.append(f"descent: {_failures(self.report)}")
+            candidate = anew
+        return self._refined(candidate, set(), problems, state, targets, self.settings.budget), Path.REOPTIMISED
 
     def _refined(
         self,
@@ -230,7 +243,7 @@ class Attempt:
         except (OutOfReach, GraspRefused) as error:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
-        recovery = funnel_recovery(state, targets, self.task, splice, self.settings.recovery_share)
+        recovery = self._recovery(splice, targets)
         fresh, problems, why = None, None, "the hand is beside the part, below the new grasp frame"
         if recovery is not None:
             problems, why = self.full.problems(state, left, targets, recovery)

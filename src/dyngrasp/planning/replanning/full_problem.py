@@ -15,10 +15,13 @@ import numpy as np
 from dyngrasp.errors import DyngraspError
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import PhaseProblem, PhaseSolver, Solution
-from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery
+from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, lifted
 from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, hold_start, stretched
 from dyngrasp.signals import Array, JointState
 from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory
+
+# The funnel is lifted in full after this share of the approach, and until as much before its end.
+_LIFTED = 0.15
 
 
 class PhasePlanner(Protocol):
@@ -70,6 +73,21 @@ class FullProblem:
         shortest = problems[APPROACH].min_duration
         longest = max(min(problems[APPROACH].max_duration, left + self.detour), shortest)
         return (replace(problems[APPROACH], constraints=rows, max_duration=longest), *problems[1:]), ""
+
+    def descent(
+        self, plan: GraspPlan, problem: PhaseProblem, state: PlanSample, targets: GraspTargets
+    ) -> GraspPlan | None:
+        """The plan with an approach that comes down the funnel anew, in closed form; None if there is none.
+
+        Limits and rows are not looked at: that is for the audit.
+        """
+        guess = self.planner.guess(problem, targets)
+        motion = None if guess is None else hold_start(guess, state.arm, targets.pregrasp, self.task, self.settings)
+        if motion is None:
+            return None
+        arm, hand = list(plan.arm), list(plan.gripper)
+        arm[APPROACH], hand[APPROACH] = motion, stretched(hand[APPROACH], motion.duration)
+        return replace(plan, arm=tuple(arm), gripper=tuple(hand))  # type: ignore[arg-type]
 
     def improve(
         self,
@@ -131,6 +149,8 @@ class FullProblem:
 
 
 def raised(problem: PhaseProblem, by: float) -> PhaseProblem:
-    """The approach with the wall of its funnel moved inward by a height (m)."""
-    rows = tuple(replace(row, lower=row.lower + by) if row.name == "funnel" else row for row in problem.constraints)
+    """The approach with the tip of its funnel lifted by a height (m), but at both ends, which are given."""
+    s = np.linspace(0.0, 1.0, problem.intervals + 1)
+    lift = by * np.clip(np.minimum(s, 1.0 - s) / _LIFTED, 0.0, 1.0)
+    rows = tuple(lifted(row, lift) if row.name == "funnel" else row for row in problem.constraints)
     return replace(problem, constraints=rows)

@@ -3,33 +3,35 @@
 Rule: over the rest of the approach, s from 0 at the splice to 1 at the pre-grasp, the height of the funnel's wall is
 multiplied by
 
-    φ(s) = min(1, φ_0 + (1 − φ_0) s / σ),
+    φ(s) = φ_0 up to s = σ_0,    then linear up to 1 at s = σ_1,
 
-where φ_0 ≤ 1 is the largest factor that leaves the hand inside at the splice, and σ < 1 a given share. A state inside
-the funnel has φ_0 = 1, and nothing is softened. Below the grasp frame no factor helps: such a state is refused.
+where σ_0 < σ_1 < 1 are given shares, and φ_0 ≤ 1 is the largest factor that leaves the hand inside at the splice and,
+went it on as before, a time τ after it: it can neither stop nor turn at once. So the hand first has time to come
+back above the part, then the wall rises. A hand that stays inside the funnel has φ_0 = 1, and nothing is softened.
+Below the grasp frame no factor helps: such a state is refused. That the fingers do not touch the part meanwhile is for
+the audit's clearances to say.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
-from dyngrasp.planning.problem import AuditReport, NodeConstraint
+from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import GraspPlan, PlanSample
 
-# Of the constraint's parameters: three of G, twelve of the grasp frame, then z_th.
-_HEIGHT_PARAMETER = 15
+# Of the constraint's parameters: three of G, nine of the grasp frame's axes by rows, three of its origin, then z_th.
+_AXES, _ORIGIN, _HEIGHT_PARAMETER = slice(3, 12), slice(12, 15), 15
 
 # The state at the splice lies this share inside the softened wall, so that an interior point remains.
 _INSIDE = 0.98
 
 # Asked of the solver at the grid points (m), for the hand cuts corners between them.
 _MARGIN = 0.001
-
-_SUBSTEPS = 4  # as the audit
 
 
 @dataclass(frozen=True)
@@ -38,15 +40,16 @@ class FunnelRecovery:
 
     Attributes:
         factor: φ_0; 1 where the state at the splice is inside the funnel.
-        share: σ.
+        shares: σ_0 and σ_1.
     """
 
     factor: float
-    share: float
+    shares: tuple[float, float]
 
     def at(self, s: Array) -> Array:
         """φ at shares s (M,) of the rest of the approach."""
-        return np.minimum(1.0, self.factor + (1.0 - self.factor) * s / self.share)
+        low, high = self.shares
+        return self.factor + (1.0 - self.factor) * np.clip((s - low) / (high - low), 0.0, 1.0)
 
     def soften(self, constraint: NodeConstraint) -> NodeConstraint:
         """The constraint "funnel" of an approach that starts at the splice."""
@@ -56,55 +59,55 @@ class FunnelRecovery:
         parameters[:, _HEIGHT_PARAMETER] *= self.at(np.linspace(0.0, 1.0, len(parameters)))
         return replace(constraint, parameters=parameters, lower=np.array([_MARGIN]))
 
-    def judge(self, report: AuditReport, plan: GraspPlan, targets: GraspTargets, task: GraspTask) -> AuditReport:
-        """The report with its entry "funnel" replaced by the softened one, where the state at the splice is outside."""
-        if self.factor >= 1.0:
-            return report
-        approach, hand = plan.arm[0], plan.gripper[0]
-        local = np.linspace(0.0, approach.duration, _SUBSTEPS * approach.intervals + 1)
-        q, q_h = approach.sample_many(local)[0], hand.sample_many(local)[0]
-        times, s = plan.start_time + local, local / approach.duration
-        height, wall = np.array(
-            [_height_and_wall(a, b, t, targets, task) for a, b, t in zip(q, q_h, times, strict=True)]
-        ).T
-        h = height - self.at(s) * wall
-        worst = int(h.argmin())
-        detail = f"softened: wall from {self.factor:.2f} of its height"
-        entries = tuple(
-            replace(entry, worst=float(h[worst]), time=float(times[worst]), detail=detail)
-            if entry.name == "funnel"
-            else entry
-            for entry in report.entries
-        )
-        return AuditReport(entries)
+    def wall(self, plan: GraspPlan) -> Callable[[Array], Array]:
+        """φ at times (s) of the approach of a plan that begins at the splice."""
+        return lambda times: self.at((times - plan.start_time) / plan.arm[0].duration)
 
 
 def funnel_recovery(
-    state: PlanSample, targets: GraspTargets, task: GraspTask, splice: float, share: float
+    plan: GraspPlan,
+    splice: float,
+    targets: GraspTargets,
+    task: GraspTask,
+    shares: tuple[float, float],
+    reaction: float,
 ) -> FunnelRecovery | None:
     """The softening that a replan needs; None if the hand is below the grasp frame and no softening helps.
 
     Args:
-        state: Of the running plan at the splice.
+        plan: The running plan, in its approach.
+        splice: When the new trajectory takes over (s).
         targets: The new targets.
         task: Arm, gripper, part.
-        splice: When the new trajectory takes over (s).
-        share: σ.
+        shares: σ_0 and σ_1.
+        reaction: τ (s).
     """
-    height, wall = _height_and_wall(state.arm.position, state.gripper.position, splice, targets, task)
-    if height - wall >= _MARGIN:
-        return FunnelRecovery(1.0, share)
-    inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
-    if inside <= 0:
-        return None
-    return FunnelRecovery(inside / wall, share)
+    factor = 1.0
+    later = min(splice + reaction, float(np.nextafter(plan.phase_ends[0], 0.0)))
+    for t in (splice, later):
+        height, wall = _height_and_wall(plan.sample(t), t, targets, task)
+        if height - wall >= _MARGIN:
+            continue
+        inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
+        if inside <= 0:
+            return None
+        factor = min(factor, inside / wall)
+    return FunnelRecovery(factor, shares)
 
 
-def _height_and_wall(q: Array, q_h: Array, t: float, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
+def lifted(constraint: NodeConstraint, by: Array) -> NodeConstraint:
+    """The constraint "funnel" with the grasp frame lifted along its axis by heights (N+1,) (m)."""
+    parameters = constraint.parameters.copy()
+    outward = parameters[:, _AXES].reshape(-1, 3, 3)[:, :, 2]
+    parameters[:, _ORIGIN] += by[:, None] * outward
+    return replace(constraint, parameters=parameters)
+
+
+def _height_and_wall(state: PlanSample, t: float, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
     """Height of G in the grasp frame and that of the wall below or above it, eq. (5) (m)."""
     gripper, funnel = task.gripper, task.grasp_object.funnel
-    T_hand = task.robot.forward_kinematics(q) * gripper.T_flange_hand
-    G = T_hand.act(gripper.grasp_point(q_h))
+    T_hand = task.robot.forward_kinematics(state.arm.position) * gripper.T_flange_hand
+    G = T_hand.act(gripper.grasp_point(state.gripper.position))
     x, y, z = (targets.T_world_object_at(t) * targets.grasp.T_object_grasp).actInv(G)
     bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
     return float(z), float(funnel.z_threshold * (1.0 - bell))

@@ -16,6 +16,7 @@ class Path(StrEnum):
     """Which way led to the answer."""
 
     TRACKING = "tracking"
+    DESCENT = "descent"
     REOPTIMISED = "reoptimised"
     FRESH = "fresh"
     KEPT = "kept"
@@ -32,7 +33,8 @@ class ReplannerSettings:
         least_horizon: Shorter rests of a phase are not touched (s): nothing could be corrected in them but violently.
         finger_clearance: Grasp updates end when the closing gap is within twice this of the part's width (m): from
             then on the fingers meet the part, which moves with them and not with its estimate.
-        recovery_share: σ of `funnel_recovery`.
+        recovery_shares: σ_0 and σ_1 of `funnel_recovery`.
+        reaction: τ of `funnel_recovery` (s).
         rounds: How often the full problem is solved and audited at most.
         settled: A moving part's grasp time is iterated until the predicted part moves less than this (m).
         gate: Whether the audit decides on publication. It does, but where the paper's own method is to be shown as it
@@ -44,7 +46,8 @@ class ReplannerSettings:
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     least_horizon: float = 0.10
     finger_clearance: float = 0.004
-    recovery_share: float = 0.6
+    recovery_shares: tuple[float, float] = (0.4, 0.8)
+    reaction: float = 0.1
     rounds: int = 3
     settled: float = 1e-7
     gate: bool = True
@@ -66,7 +69,7 @@ class ReplanResult:
         targets: What the new plan was made for.
         audit: Of the new plan, or of the candidate that failed; None if none was audited.
         recovery: φ_0 of the funnel, 1 where nothing was softened.
-        timings_ms: Wall time of each stage (ms): "targets", "tracking", "audit", "full", "fresh",
+        timings_ms: Wall time of each stage (ms): "targets", "tracking", "audit", "descent", "full", "fresh",
             "total".
         message: Why the old plan was kept, or why the first ways failed.
         iterations: Of the tracking program's interior point method; 0 where no box was active.
