@@ -49,7 +49,7 @@ class Trajectory:
             raise InvalidTrajectory(f"position, velocity and acceleration need one shape (N+1, n), N ≥ 1; got {shapes}")
         if not (np.isfinite(self.duration) and self.duration > 0):
             raise InvalidTrajectory(f"duration must be a positive number of seconds, got {self.duration}")
-        if not all(np.isfinite(a).all() for a in (self.position, self.velocity, self.acceleration)):
+        if not _all_finite(self.position, self.velocity, self.acceleration):
             raise InvalidTrajectory("a trajectory holds finite numbers only")
 
     @property
@@ -87,6 +87,27 @@ class Trajectory:
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
         return _largest_defect(self.duration, self.position, self.velocity, self.acceleration)
+
+
+@njit(cache=True)
+def largest_difference(a, b):
+    """Largest |a − b| of two vectors (n,); NaN if one of their elements is."""
+    largest = 0.0
+    for i in range(a.size):
+        step = abs(a[i] - b[i])
+        # A NaN, once found, stays.
+        if not step <= largest and largest == largest:
+            largest = step
+    return largest
+
+
+@njit(cache=True)
+def _all_finite(position, velocity, acceleration):
+    for k in range(position.shape[0]):
+        for i in range(position.shape[1]):
+            if not (np.isfinite(position[k, i]) and np.isfinite(velocity[k, i]) and np.isfinite(acceleration[k, i])):
+                return False
+    return True
 
 
 @njit(cache=True, error_model="numpy")
@@ -180,7 +201,7 @@ class GraspPlan:
     def _check_joins(phases: tuple[Trajectory, ...], what: str) -> None:
         for i in range(len(phases) - 1):
             for name in ("position", "velocity"):
-                jump = float(np.abs(getattr(phases[i], name)[-1] - getattr(phases[i + 1], name)[0]).max())
+                jump = largest_difference(getattr(phases[i], name)[-1], getattr(phases[i + 1], name)[0])
                 if jump > JOIN_TOLERANCE:
                     raise InvalidTrajectory(
                         f"{what}: {name} jumps by {jump:.2e} between {PHASE_NAMES[i]} and {PHASE_NAMES[i + 1]}"

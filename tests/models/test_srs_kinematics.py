@@ -113,7 +113,7 @@ def test_elbow_is_highest_at_arm_angle_zero() -> None:
     assert found.arm_angles[int(np.argmax(heights))] == pytest.approx(0.0, abs=1e-12)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(postures())
 def test_round_trip(q: np.ndarray) -> None:
     assume(far_from_singular(q, 1e-3))
@@ -122,7 +122,7 @@ def test_round_trip(q: np.ndarray) -> None:
     assert np.abs(solved - q).max() < 1e-8
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(postures(), st.integers(1, 40))
 def test_scan_finds_admissible_configurations_of_the_pose_and_says_which(q: np.ndarray, count: int) -> None:
     assume(far_from_singular(q, 1e-3))
@@ -162,7 +162,7 @@ def test_eight_branches_share_the_elbow() -> None:
     np.testing.assert_allclose(WIDE.solve(T, 0.6 + 2.0 * math.pi, 5), solutions[5], atol=1e-13)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(lined_up_postures())
 def test_lined_up_joints_are_solved_without_nan(q: np.ndarray) -> None:
     T = ROBOT.forward_kinematics(q)
@@ -276,7 +276,7 @@ def test_null_space_rate_turns_the_elbow_at_unit_rate_and_holds_the_flange() -> 
     assert checked > 200
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.one_of(lined_up_postures(), postures()))
 def test_null_space_rate_holds_the_flange_even_where_joints_line_up(q: np.ndarray) -> None:
     rate = ARM.null_space_rate(q)

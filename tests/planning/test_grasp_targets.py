@@ -37,7 +37,7 @@ def travel_time(task, q_start, q) -> float:
     return float((np.abs(q - q_start) / speed).max() + (np.abs(task.place - q) / speed).max())
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40, derandomize=True)
 @given(poses)
 def test_boundary_states_by_forward_kinematics(task, q_start, pose):
     T = standing(task, *pose)
@@ -78,7 +78,7 @@ def test_boundary_states_by_forward_kinematics(task, q_start, pose):
     np.testing.assert_array_equal(targets.place.velocity, 0.0)
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25, derandomize=True)
 @given(poses)
 def test_the_arm_swivels_on_through_the_grasp(task, q_start, pose):
     """Both ends turn the elbow the same way, and the pre-grasp lies behind by about what the turn covers."""
@@ -95,7 +95,7 @@ def test_the_arm_swivels_on_through_the_grasp(task, q_start, pose):
     assert turned * rates[1] > 0
 
 
-@settings(max_examples=8, deadline=None, derandomize=True)
+@settings(max_examples=8, derandomize=True)
 @given(poses)
 def test_the_first_is_the_fastest_of_all_and_the_others_follow(task, q_start, pose):
     T = standing(task, *pose)

@@ -35,7 +35,7 @@ from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.signals import Array, read_only
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
 __all__ = ["BRANCHES", "ROUNDING", "ElbowCircle", "SrsChain", "configurations", "joint_vector"]
 
@@ -178,11 +178,6 @@ def joint_vector(q: ArrayLike) -> Array:
     return q
 
 
-def configurations(circle: ElbowCircle, psi: Array, branches: NDArray[np.int64]) -> Array:
-    """Joint angles (m, b, 7) (rad, whole turns arbitrary) at arm angles psi (m,) on some branches (m, b) of each."""
-    return _configurations(circle.elbow, circle.rotations, psi, branches, _SIGNS, _TURNS)
-
-
 @njit(cache=True, error_model="numpy")
 def _shoulder_to_wrist(q, a, b):
     """Unit vector u from S to W and the y axis of the upper arm (opposite to joint 4's axis), both in the base."""
@@ -256,7 +251,11 @@ def _circle(R, p, lengths, nearest, farthest):
 
 
 @njit(cache=True, error_model="numpy")
-def _configurations(elbow, rotations, psi, branches, signs, turns):
+def configurations(elbow, rotations, psi, branches):
+    """Joint angles (m, b, 7) (rad, whole turns arbitrary) at arm angles psi (m,) on some branches (m, b) of each.
+
+    `elbow` and `rotations` are those of the `ElbowCircle`.
+    """
     out = np.empty((psi.size, branches.shape[1], 7))
     R, first = np.empty(18), np.empty(7)
     for m in range(psi.size):
@@ -268,7 +267,7 @@ def _configurations(elbow, rotations, psi, branches, signs, turns):
         for k in range(branches.shape[1]):
             q, branch = out[m, k], branches[m, k]
             for i in range(7):
-                q[i] = first[i] * signs[branch, i] + turns[branch, i]
+                q[i] = first[i] * _SIGNS[branch, i] + _TURNS[branch, i]
             if shoulder:
                 _share_turn(q[:3], first[1])
             if wrist:

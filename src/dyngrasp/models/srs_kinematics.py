@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["BRANCHES", "SrsKinematics", "SrsSolutions"]
 
 ARM_ANGLES = 72
+_REFINED = 4  # local minima on the grid of arm angles that are looked into
 CHAIN_ROUNDING = 1e-9
 """Largest difference (m, rad) between the chain of a model file and the closed form: they must be the same arm."""
 
@@ -244,45 +245,17 @@ class SrsKinematics:
         q_reference = joint_vector(q_reference)
         if not np.isfinite(q_reference).all():
             raise InvalidProblem(f"q_reference: finite numbers expected, got {q_reference.tolist()}")
-        circle = self._circle(T_world_flange)
-        weight = 1.0 / np.asarray(self.limits.velocity)
-
-        def evaluate(psi: Array, branches: NDArray[np.int64]) -> tuple[Array, Array]:
-            q, within = self._configurations(circle, psi, branches)
-            return q, _weighted_squares(q, within, q_reference, weight)
-
-        own = self.arm_angle(q_reference)
+        circle, own = self._circle(T_world_flange), self.arm_angle(q_reference)
+        weight, limits = 1.0 / np.asarray(self.limits.velocity), self.limits
         # Intervals narrower than the grid are rare; only where nothing else is left is the finer grid worth its time.
         for size in (ARM_ANGLES, 20 * ARM_ANGLES):
-            grid, step = own + _grid(size), 2.0 * math.pi / size
-            q, cost = evaluate(grid, _every_branch(size))
-            if np.isfinite(cost).any():
-                break
-        else:
-            raise self._forbidden(20 * ARM_ANGLES)
-        minima = (cost <= np.roll(cost, 1, axis=0)) & (cost <= np.roll(cost, -1, axis=0)) & np.isfinite(cost)
-        at, branch = np.nonzero(minima)
-        first = np.argsort(cost[at, branch], kind="stable")[:4]
-        at, branch = at[first], branch[first]
-        rows = np.arange(at.size)
-        psi, best_q, best = grid[at], q[at, branch], cost[at, branch]
-        offsets = np.linspace(-1.0, 1.0, 17)
-        while step > 1e-9:
-            trial = psi[:, None] + step * offsets
-            q, cost = evaluate(trial.ravel(), np.repeat(branch, offsets.size)[:, None])
-            q, cost = q.reshape(*trial.shape, 7), cost.reshape(trial.shape)
-            pick = cost.argmin(axis=1)
-            better = cost[rows, pick] < best
-            psi = np.where(better, trial[rows, pick], psi)
-            best_q = np.where(better[:, None], q[rows, pick], best_q)
-            best = np.where(better, cost[rows, pick], best)
-            if step < 1e-2 and best.size > 1:
-                # By now all that is left to gain is far below this.
-                wins = best <= 1.05 * best.min() + 1e-9
-                psi, branch, best_q, best = psi[wins], branch[wins], best_q[wins], best[wins]
-                rows = np.arange(best.size)
-            step /= 6.0  # wider than the spacing of 1/8: noise near the minimum cannot push it out of the next window
-        return best_q[best.argmin()]
+            q, cost = _nearest(
+                circle.elbow, circle.rotations, own + _grid(size), 2.0 * math.pi / size, _every_branch(size),
+                q_reference, weight, self._middle, limits.position_lower, limits.position_upper,
+            )  # fmt: skip
+            if math.isfinite(cost):
+                return q
+        raise self._forbidden(20 * ARM_ANGLES)
 
     def _forbidden(self, count: int) -> OutOfReach:
         reason = f"the joint limits forbid every branch at all {count} arm angles tried"
@@ -295,9 +268,55 @@ class SrsKinematics:
         self, circle: ElbowCircle, psi: Array, branches: NDArray[np.int64]
     ) -> tuple[Array, NDArray[np.bool_]]:
         """`srs_chain.configurations` turned to the middle of the ranges, and whether each keeps the limits, (m, b)."""
-        q = configurations(circle, psi, branches)
         limits = self.limits
-        return q, _turned_within(q, self._middle, limits.position_lower, limits.position_upper)
+        return _admissible(
+            circle.elbow, circle.rotations, psi, branches, self._middle, limits.position_lower, limits.position_upper
+        )
+
+
+@njit(cache=True, error_model="numpy")
+def _nearest(elbow, rotations, grid, step, branches, reference, weight, middle, lower, upper):
+    """The configuration (7,) nearest to a reference, and its distance squared; inf if none on the grid is admissible.
+
+    The best local minima of the grid are searched on ever finer grids about the best angle so far.
+    """
+    q, within = _admissible(elbow, rotations, grid, branches, middle, lower, upper)
+    cost = _weighted_squares(q, within, reference, weight)
+    count = grid.size
+    minima = np.full(cost.shape, np.inf)
+    for m in range(count):
+        for k in range(cost.shape[1]):
+            if cost[m, k] <= cost[m - 1, k] and cost[m, k] <= cost[(m + 1) % count, k]:
+                minima[m, k] = cost[m, k]
+    best_q, best = np.empty(7), np.inf
+    offsets = np.linspace(-1.0, 1.0, 17)
+    branch = np.empty((offsets.size, 1), np.int64)
+    for flat in np.argsort(minima.ravel())[:_REFINED]:
+        m, k = flat // cost.shape[1], flat % cost.shape[1]
+        if not np.isfinite(minima[m, k]):
+            break
+        width, angle, least, found = step, grid[m], cost[m, k], q[m, k].copy()
+        branch[:] = branches[m, k]
+        while width > 1e-9:
+            trial, within = _admissible(elbow, rotations, angle + width * offsets, branch, middle, lower, upper)
+            costs = _weighted_squares(trial, within, reference, weight)[:, 0]
+            pick = costs.argmin()
+            if costs[pick] < least:
+                least, angle, found = costs[pick], angle + width * offsets[pick], trial[pick, 0].copy()
+            # Wider than the spacing of 1/8: noise near the minimum cannot push it out of the next window.
+            width /= 6.0
+            # By then all that is left to gain is far below this.
+            if width < 1e-3 and least > 1.05 * best + 1e-9:
+                break
+        if least < best:
+            best, best_q = least, found
+    return best_q, best
+
+
+@njit(cache=True, error_model="numpy")
+def _admissible(elbow, rotations, psi, branches, middle, lower, upper):
+    q = configurations(elbow, rotations, psi, branches)
+    return q, _turned_within(q, middle, lower, upper)
 
 
 @njit(cache=True, error_model="numpy")

@@ -36,7 +36,7 @@ from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry
 from dyngrasp.signals import Array, read_only
-from dyngrasp.trajectory import GraspPlan, Trajectory
+from dyngrasp.trajectory import GraspPlan, Trajectory, largest_difference
 
 Indices = NDArray[np.intp]
 
@@ -356,7 +356,7 @@ def _times_along(grid, q, q_h, start, joint_step):
     path = np.zeros(grid.size)
     for k in range(last):
         # Where both stand still the path needs a slope too, for times to be read from it.
-        path[k + 1] = path[k] + _largest_step(q, k) + _largest_step(q_h, k) + 1e-9
+        path[k + 1] = path[k] + largest_difference(q[k + 1], q[k]) + largest_difference(q_h[k + 1], q_h[k]) + 1e-9
     if not np.isfinite(path[last]):
         # A number that is none is looked at.
         return grid[grid >= start]
@@ -365,14 +365,3 @@ def _times_along(grid, q, q_h, start, joint_step):
     times = np.interp(begin + (path[last] - begin) / count * np.arange(count + 1), path, grid)
     times[0], times[count] = start, grid[last]
     return times
-
-
-@njit(cache=True)
-def _largest_step(q, k):
-    largest = 0.0
-    for i in range(q.shape[1]):
-        step = abs(q[k + 1, i] - q[k, i])
-        # A NaN, once found, stays.
-        if not step <= largest and largest == largest:
-            largest = step
-    return largest

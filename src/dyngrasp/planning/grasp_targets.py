@@ -318,7 +318,7 @@ def check_grasp(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> None:
     T_world_grasp = T_world_object * grasp.T_object_grasp
     lever = T_world_object.act(part.centre_of_mass) - T_world_grasp.translation
     weight = part.mass * np.array([0.0, 0.0, -GRAVITY])
-    moment = abs(float(T_world_grasp.rotation[:, 1] @ np.cross(lever, weight)))
+    moment = abs(float(T_world_grasp.rotation[:, 1] @ pin.skew(lever) @ weight))
     pinch = task.pinch(grasp)
     capacity = 2 * pinch.torsional * pinch.force
     if capacity < settings.holding_safety * moment:

@@ -23,7 +23,7 @@ def grasp_frame(task, q, posture):
     return task.robot.forward_kinematics(q) * gripper.T_flange_hand * gripper.T_hand_grasp(posture)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(**MOVES)
 def test_hand_comes_to_the_new_pose_by_the_same_branch_and_arm_angle(task, targets, x, y, turn):
     T = displaced(targets.T_world_object, x, y, turn)
@@ -41,7 +41,7 @@ def test_hand_comes_to_the_new_pose_by_the_same_branch_and_arm_angle(task, targe
         assert abs(kinematics.arm_angle(state.position) - kinematics.arm_angle(old.position)) < 1e-9
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(**MOVES)
 def test_small_moves_of_the_part_are_small_moves_of_the_arm(task, targets, x, y, turn):
     T = targets.T_world_object

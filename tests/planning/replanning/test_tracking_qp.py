@@ -196,7 +196,7 @@ def kkt_residuals(p, solution):
     return np.abs(residual).max() / np.abs(gradient).max(), float(-g.min()), float(-lam.min() / np.abs(lam).max())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 10**6),
     move=st.floats(0.0, 0.3),

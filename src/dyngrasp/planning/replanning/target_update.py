@@ -155,5 +155,5 @@ def _carried(twist: Array, T_world_object: pin.SE3, T_world_flange: pin.SE3) -> 
     """(6,) twist of the flange as it would be fixed to the part."""
     lever = T_world_flange.translation - T_world_object.translation
     carried = twist.copy()
-    carried[:3] += np.cross(twist[3:], lever)
+    carried[:3] += pin.skew(twist[3:]) @ lever
     return carried
