@@ -12,6 +12,7 @@ them its difference to the old motion is a polynomial.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +20,7 @@ import pinocchio as pin
 from dyngrasp.errors import OutOfReach
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.replanning.target_update import target_updater
-from dyngrasp.signals import Array
+from dyngrasp.signals import Array, read_only
 from dyngrasp.trajectory import Trajectory
 
 _KNOTS = 4
@@ -88,7 +89,7 @@ def carried_descent(
         middle = (above + below) // 2
         above, below = (middle, below) if height(middle) > top else (above, middle)
     entry = min(max(below, round(settings.earliest * N)), N - _KNOTS)
-    knots = np.unique(np.linspace(entry, N, _KNOTS).round().astype(int))
+    knots = _knots(entry, N)
     try:
         carried = [
             updater.posture(shift(k) * robot.forward_kinematics(reference.position[k]), reference.position[k])
@@ -96,12 +97,11 @@ def carried_descent(
         ]
     except OutOfReach:
         return None
-    difference = np.vstack([*carried, q_pregrasp]) - reference.position[knots]
-    s = np.arange(entry, N + 1) / N
+    difference = np.array([*carried, q_pregrasp]) - reference.position[list(knots)]
     position, velocity, acceleration = (
         array.copy() for array in (reference.position, reference.velocity, reference.acceleration)
     )
-    basis, rate, curvature = _lagrange(knots / N, s)
+    basis, rate, curvature = _lagrange(entry, N)
     T = reference.duration
     position[entry:] += basis @ difference
     velocity[entry:] += rate @ difference / T
@@ -118,8 +118,18 @@ def _since(targets: GraspTargets | None, now: float, end: float) -> pin.SE3:
     return targets.T_world_object_at(now) * targets.T_world_object_at(end).inverse()
 
 
-def _lagrange(knots: Array, s: Array) -> tuple[Array, Array, Array]:
-    """Values, first and second derivatives (M, K) of the Lagrange polynomials of K knots at s (M,)."""
+def _knots(entry: int, N: int) -> tuple[int, ...]:
+    """`_KNOTS` grid points from `entry` to N."""
+    return tuple(entry + round(i * (N - entry) / (_KNOTS - 1)) for i in range(_KNOTS))
+
+
+@lru_cache(maxsize=512)
+def _lagrange(entry: int, N: int) -> tuple[Array, Array, Array]:
+    """Values, first and second derivatives of the Lagrange polynomials of `_knots` (M, K), at grid points from `entry`.
+
+    The argument is the share of the duration.
+    """
+    knots, s = np.array(_knots(entry, N)) / N, np.arange(entry, N + 1) / N
     # About their middle, for powers of numbers near one are nearly alike.
     middle = knots.mean()
     inverse = np.linalg.inv(np.vander(knots - middle, increasing=True))
@@ -127,4 +137,4 @@ def _lagrange(knots: Array, s: Array) -> tuple[Array, Array, Array]:
     order = np.arange(1, len(knots))
     first = powers[:, :-1] * order
     second = first[:, :-1] * order[:-1]
-    return powers @ inverse, first @ inverse[1:], second @ inverse[2:]
+    return read_only(powers @ inverse), read_only(first @ inverse[1:]), read_only(second @ inverse[2:])
