@@ -1,5 +1,7 @@
 """Replanning in physics: it delivers where the first plan cannot, joins without a jump, and keeps its latency."""
 
+import itertools
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +16,7 @@ from dyngrasp.experiments.metrics import judge
 from dyngrasp.perception.pose_noise import PoseNoise, PoseNoiseSettings
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.structured import StructuredSolver
+from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.replanner import Path, Replanner
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
 from dyngrasp.simulation.scene import build_scene
@@ -92,6 +95,54 @@ def test_answers_after_their_splice_are_late_and_change_nothing(planned, replann
     assert all(event.late for event in usable if event.result.path is not Path.FRESH)
     assert loop.newest is planned.plan
     assert not outcome.success
+
+
+def measured(planned, planner):
+    """A replanner whose deadline is this machine's, in a loop that waits for each answer as long as it took."""
+    replanner = Replanner(planned.task, None, StructuredSolver(), planner)
+    # What is compiled or loaded at a first call is no part of a cycle.
+    replanner.replan(planned.plan, planned.targets, planned.plan.start_time)
+    record, loop, _ = episode(planned, OFF, replanner, settings=ReplanningSettings(latency=None))
+    assert loop is not None
+    return record, loop, replanner
+
+
+def test_a_measured_latency_is_the_time_that_the_answer_took(planned, replanner):
+    record, loop, real = measured(planned, replanner.full.planner)
+    assert loop.events
+    for event in loop.events:
+        assert event.ready == pytest.approx(event.t + 1e-3 * event.result.timings_ms["total"])
+        if event.result.ok:
+            # Whatever the load of the machine: the clock is looked at last, and what took longer is no result.
+            budget = real.settings.fresh_budget if event.result.path is Path.FRESH else real.settings.budget
+            assert event.result.timings_ms["total"] <= 1e3 * budget
+            assert not event.late
+    # No question is asked before the answer to the former is there.
+    for first, second in itertools.pairwise(loop.events):
+        assert second.t >= first.ready - 1e-9
+    # What ran is, at every moment, the newest plan that had been there by its splice.
+    ran = [(planned.plan.start_time, planned.plan)]
+    ran += [(event.result.splice, event.result.plan) for event in loop.events if event.result.ok]
+    for t, asked in zip(record.t[::50], record.arm_planned[::50], strict=True):
+        latest = [plan for start, plan in ran if start <= t + 1e-9][-1]
+        np.testing.assert_allclose(asked, latest.sample(t).arm.position, atol=1e-9)
+
+
+def test_a_machine_too_slow_for_the_budget_publishes_nothing(planned, replanner, monkeypatch):
+    from dyngrasp.planning.replanning import attempt
+
+    track = attempt.track
+
+    def slow_track(*arguments):
+        time.sleep(0.025)
+        return track(*arguments)
+
+    monkeypatch.setattr(attempt, "track", slow_track)
+    _, loop, _ = measured(planned, replanner.full.planner)
+    tracked = [event for event in loop.events if "tracking" in event.result.timings_ms]
+    assert len(tracked) >= 5
+    assert all(event.result.status is Status.DEADLINE_MISSED for event in tracked)
+    assert loop.newest is planned.plan
 
 
 def test_what_a_nearing_camera_reveals_is_enough(planned, replanner):
