@@ -19,7 +19,9 @@ from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.plant import Truth
-from dyngrasp.trajectory import GraspPlan
+from dyngrasp.trajectory import PHASE_NAMES, GraspPlan
+
+_GRASP = PHASE_NAMES.index("grasp")
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class ReplanningLoop:
         self.settings = settings or ReplanningSettings()
         self.events: list[ReplanEvent] = []
         self.not_taken: list[float] = []
-        """Times at which a replan was due but the estimate too uncertain (s)."""
+        """Times before the part is in the hand at which a replan was due but the estimate too uncertain (s)."""
         self._replanner, self._source = replanner, source
         self._running, self._next, self._targets = plan, plan, targets
         self._asked: ReplanEvent | None = None
@@ -114,7 +116,7 @@ class ReplanningLoop:
             self._running = self._next
         if ask and self._asked is None:
             estimate = self._source.estimate(truth, t)
-            if grasp_point_deviation(estimate, self._targets.grasp) > self.settings.largest_deviation:
+            if t < self._next.phase_ends[_GRASP] and self._is_vague(estimate):
                 self.not_taken.append(t)
                 return self._running
             result = self._replanner.replan_to_pose(self._next, self._targets, estimate, t)
@@ -126,6 +128,9 @@ class ReplanningLoop:
             self._asked = ReplanEvent(t, result, t + took, t + took > result.splice + 1e-9)
             self._receive(t)
         return self._running
+
+    def _is_vague(self, estimate: PoseEstimate) -> bool:
+        return grasp_point_deviation(estimate, self._targets.grasp) > self.settings.largest_deviation
 
     def _receive(self, t: float) -> None:
         event = self._asked

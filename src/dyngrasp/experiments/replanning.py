@@ -47,20 +47,23 @@ def replanning_loop(
     plan: GraspPlan,
     targets: GraspTargets,
     planner: CollocationPlanner,
-    camera: PoseSource | None = None,
+    source: PoseSource | None = None,
 ) -> ReplanningLoop | None:
-    """The loop of a trial; None if the scenario keeps the first plan. `camera` is the source where there is one."""
+    """The loop of a trial; None if the scenario keeps the first plan.
+
+    `source` is a camera or the user's own; truth and noise model are made here.
+    """
     section = workcell.scenario.replanner
     if not section.enabled:
         return None
-    source = camera or pose_source(workcell.scenario.pose, trial, targets.grasp)
+    # What the noise model says of itself rests on knowing its own error: no sensor does, so it is not judged by it.
+    bound = np.inf if source is None else 1e-3 * section.largest_deviation_mm
+    source = source or pose_source(workcell.scenario.pose, trial, targets.grasp)
     latency = None if section.latency_ms == "measured" else 1e-3 * float(section.latency_ms)
     replanner = replanner_for(workcell.task, section, planner)
     if latency is None:
         # What is compiled or loaded at the first call would count as latency of the first replan.
         replanner.replan(plan, targets, plan.start_time)
-    # The noise model's covariance is that of one draw of its own; what a camera says of itself may be judged.
-    bound = 1e-3 * workcell.scenario.camera.largest_deviation_mm if camera is not None else np.inf
     return ReplanningLoop(
         replanner, source, plan, targets, ReplanningSettings(section.rate_hz, latency, largest_deviation=bound)
     )

@@ -190,9 +190,8 @@ class CameraSection(StrictSchema):
 
     Without `width` and `height` they are as large as the camera's own. `exposures` moments of each exposure are drawn
     and averaged, which is its motion blur. `latency_ms` is from the end of the exposure to the pose in the filter. Each
-    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction. While the grasp
-    point is known worse than to `largest_deviation_mm` the replanner takes no updates. `dyngrasp run` keeps one picture
-    of `keep_every`; 0 keeps none.
+    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction. `dyngrasp run`
+    keeps one picture of `keep_every`; 0 keeps none.
     """
 
     model: str = "ava1000"
@@ -207,7 +206,6 @@ class CameraSection(StrictSchema):
     mount_deg: NonNegative = 0.0
     prior_mm: Annotated[float, Field(gt=0.0)] = 30.0
     prior_deg: Annotated[float, Field(gt=0.0)] = 10.0
-    largest_deviation_mm: Annotated[float, Field(gt=0.0)] = 5.0
     keep_every: Annotated[int, Field(ge=0)] = 3
 
     @model_validator(mode="after")
@@ -221,7 +219,9 @@ class ReplannerSection(StrictSchema):
     """`[replanner]`: whether the plan is replaced as the pose becomes known, how often (Hz), and how fast.
 
     `latency_ms` is the time from question to answer, `"measured"` what it really takes on this machine; what takes
-    longer than `budget_ms` is discarded. `mode = "lcqp"` is the paper's program and update, published unchecked.
+    longer than `budget_ms` is discarded. `mode = "lcqp"` is the paper's program and update, published unchecked. While
+    a camera, or a source of the user's, knows the grasp point worse than to `largest_deviation_mm` (one standard
+    deviation), its updates are not taken; the noise model's are.
     """
 
     enabled: bool = False
@@ -229,6 +229,7 @@ class ReplannerSection(StrictSchema):
     budget_ms: Annotated[float, Field(gt=0.0, le=100.0)] = 20.0
     latency_ms: NonNegative | Literal["measured"] = 20.0
     mode: Literal["exact", "lcqp"] = "exact"
+    largest_deviation_mm: Annotated[float, Field(gt=0.0)] = 5.0
 
 
 class PlantSection(StrictSchema):

@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_episode
+from dyngrasp.closed_loop.pose_source import PoseSource
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.closed_loop.replanning_loop import ReplanEvent
 from dyngrasp.closed_loop.vision_record import VisionRecord
@@ -128,6 +129,7 @@ def execute_trial(
     planned: PlannedTrial,
     progress: Callable[[float, str], None] | None = None,
     planner: CollocationPlanner | None = None,
+    source: PoseSource | None = None,
 ) -> ExecutedTrial:
     """Carry out a valid plan in the plant that the trial drew, and judge what happened.
 
@@ -137,17 +139,19 @@ def execute_trial(
         planned: A plan that passed its audit.
         progress: Called with time (s) and phase as the episode runs.
         planner: States the problems that the replanner falls back on; one is made if it is needed and left out.
+        source: Tells the replanner where the part is, in place of what the scenario's `[pose]` says.
     """
     task, plan = workcell.task, planned.result.require()
     period = 1.0 / workcell.scenario.plant.control_rate_hz
     settings = SceneSettings(timestep=min(SceneSettings().timestep, period))
+    filmed = films(workcell) and source is None
     scene = build_scene(
         task.robot,
         task.gripper,
         task.grasp_object,
         trial.variation,
         settings,
-        markers=films(workcell),
+        markers=filmed,
         conveyor=trial.conveyor,
     )
     plant: TruthfulPlant = MujocoPlant(
@@ -156,10 +160,11 @@ def execute_trial(
     controller = grasp_controller(task, planned.targets.grasp, period)
     meta = {"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()}
     with ExitStack() as stack:
-        camera = stack.enter_context(camera_poses(workcell, trial, plan, scene)) if films(workcell) else None
+        camera = stack.enter_context(camera_poses(workcell, trial, plan, scene)) if filmed else None
         if camera is not None:
             plant = camera.filmed(plant)
-        loop = replanning_loop(workcell, trial, plan, planned.targets, planner or planner_for(workcell), camera)
+        planner = planner or planner_for(workcell)
+        loop = replanning_loop(workcell, trial, plan, planned.targets, planner, source or camera)
         record = run_episode(
             plan,
             plant,

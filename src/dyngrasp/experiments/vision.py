@@ -64,7 +64,13 @@ def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene
     streams = np.random.SeedSequence(trial.seed, spawn_key=(_IMAGE_STREAM,)).spawn(2)
     believed = _misplaced(true, 1e-3 * section.mount_mm, np.deg2rad(section.mount_deg), streams[0])
     deviations = np.repeat([1e-3 * section.prior_mm, np.deg2rad(section.prior_deg)], 3)
-    prior = PoseEstimate(trial.T_world_object_believed, np.diag(deviations**2), plan.start_time, plan.start_time)
+    prior = PoseEstimate(
+        trial.T_world_object_believed,
+        np.diag(deviations**2),
+        plan.start_time,
+        plan.start_time,
+        trial.twist_believed,
+    )
     imaging = ImagingSettings(
         brightness=section.brightness,
         noise=section.noise,
