@@ -36,11 +36,16 @@ class CompilationError(Exception):
 
 def compiler() -> tuple[str, ...] | None:
     """The command of the C compiler, None if there is none or none is wanted."""
-    wanted = os.environ.get(COMPILER_VARIABLE)
+    return _found(os.environ.get(COMPILER_VARIABLE), os.environ.get("PATH"))
+
+
+@functools.cache
+def _found(wanted: str | None, path: str | None) -> tuple[str, ...] | None:
+    """The command in these circumstances: looked for once, as it is asked for in every solve."""
     if wanted is not None:
         command = tuple(shlex.split(wanted))
-        return command if command and shutil.which(command[0]) else None
-    found = next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))), None)
+        return command if command and shutil.which(command[0], path=path) else None
+    found = next((found for name in ("cc", "gcc", "clang") if (found := shutil.which(name, path=path))), None)
     return (found,) if found else None
 
 

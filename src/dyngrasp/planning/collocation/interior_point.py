@@ -225,7 +225,7 @@ class InteriorPoint:
         """Newton matrix at the current point, its inertia corrected; False if that fails beyond repair."""
         rows.stiffness(self.s, self.t, self.multiplier, self.price, self.omega)
         model = self.model
-        unit = self.unit / (model.problem.intervals * self.T**2)
+        unit = self.unit / (model.intervals * self.T**2)
         curvature, shift = 1.0, 0.0
         while not model.factorise(self.omega, self.multiplier, curvature, shift):
             # Without the curvature of the rows all that is left is convex but for T; with some of it steps are better.

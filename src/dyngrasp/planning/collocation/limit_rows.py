@@ -13,15 +13,17 @@ checked beforehand and stand here as the constant 1, which an interior point met
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from dyngrasp.planning.collocation.closed_form import SHORTEST_DURATION
 from dyngrasp.planning.collocation.node_functions import NodeFunctions
 from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, Indices
-from dyngrasp.planning.problem import PhaseProblem
+from dyngrasp.planning.problem import NodeConstraint, PhaseProblem
 from dyngrasp.signals import Array
 
 UNBOUNDED = 1e12  # an infinite limit as a number: its row then never comes near zero
@@ -34,8 +36,8 @@ class LimitRows:
     """Data of the rows of one problem.
 
     Attributes:
-        middle, half_width: (n,) of the position limits (rad).
-        velocity, acceleration: (n,) limits; `acceleration` is empty if there is none.
+        middle, half_width, velocity: (n,) of the limits of positions (rad) and velocities (rad/s), or empty.
+        acceleration: (n,) limits, empty if there is none.
         lower_index, upper_index: Which of the constraints' rows have a finite lower or upper bound.
         lower, upper: (m,) bounds divided by the scale.
         inverse_scale: (m,)
@@ -63,21 +65,40 @@ class LimitRows:
     @classmethod
     def of(cls, problem: PhaseProblem, functions: list[NodeFunctions]) -> LimitRows:
         """The rows of a problem whose constraints are evaluated by `functions`, in the same order."""
-        q_min = np.maximum(problem.position_lower, -UNBOUNDED)
-        q_max = np.minimum(problem.position_upper, UNBOUNDED)
-        limited = np.isfinite(problem.acceleration_limit).any()
-        acceleration = np.minimum(problem.acceleration_limit, UNBOUNDED) if limited else np.empty(0)
+        return cls._of(problem, problem.constraints, functions, slice(None))
+
+    @classmethod
+    def without_boxes(
+        cls, problem: PhaseProblem, constraints: Sequence[NodeConstraint], functions: list[NodeFunctions]
+    ) -> LimitRows:
+        """The rows of some of a problem's constraints alone, and the bounds of the duration."""
+        return cls._of(problem, constraints, functions, slice(0))
+
+    @classmethod
+    def _of(
+        cls,
+        problem: PhaseProblem,
+        constraints: Sequence[NodeConstraint],
+        functions: list[NodeFunctions],
+        boxes: slice,
+    ) -> LimitRows:
+        q_min = np.maximum(problem.position_lower, -UNBOUNDED)[boxes]
+        q_max = np.minimum(problem.position_upper, UNBOUNDED)[boxes]
+        velocity = np.minimum(problem.velocity_limit, UNBOUNDED)[boxes]
+        acceleration = np.minimum(problem.acceleration_limit, UNBOUNDED)[boxes]
+        if not (acceleration < UNBOUNDED).any():
+            acceleration = np.empty(0)
         none = [np.empty(0)]
-        scale = np.concatenate([c.scale for c in problem.constraints] or none)
-        lower = np.concatenate([c.lower for c in problem.constraints] or none) / scale
-        upper = np.concatenate([c.upper for c in problem.constraints] or none) / scale
+        scale = np.concatenate([c.scale for c in constraints] or none)
+        lower = np.concatenate([c.lower for c in constraints] or none) / scale
+        upper = np.concatenate([c.upper for c in constraints] or none) / scale
         widening = np.maximum(0.0, NARROWEST - (upper - lower)) / 2
         free = np.concatenate([f.depends_on_acceleration for f in functions] or none)
         lower_index, upper_index = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
-        of_row = [c.name for c in problem.constraints for _ in range(c.lower.size)]
+        of_row = [c.name for c in constraints for _ in range(c.lower.size)]
         names = (
-            2 * problem.joints * ["position"]
-            + 2 * problem.joints * ["velocity"]
+            2 * velocity.size * ["position"]
+            + 2 * velocity.size * ["velocity"]
             + 2 * acceleration.size * ["acceleration"]
         )
         names += [of_row[i] for i in (*lower_index, *upper_index)]
@@ -85,7 +106,7 @@ class LimitRows:
         return cls(
             (q_max + q_min) / 2,
             np.maximum((q_max - q_min) / 2, NARROWEST),
-            np.minimum(problem.velocity_limit, UNBOUNDED),
+            velocity,
             acceleration,
             lower_index,
             upper_index,
@@ -127,6 +148,16 @@ class LimitRows:
             return np.inf, self.names[worst]
         return (-float(least[worst]), self.names[worst]) if least[worst] < 0 else (0.0, "")
 
+    def violated_rows(self, g: Array, tolerance: float) -> tuple[NDArray[np.intp], int] | None:
+        """Which of the rows c are violated, and the first grid point where one is; None if other limits are too."""
+        at_points = g[:-2].reshape(-1, self.rows_per_point) < -tolerance
+        boxes = self.rows_per_point - self.lower_index.size - self.upper_index.size
+        if (g[-2:] < -tolerance).any() or at_points[:, :boxes].any():
+            return None
+        sides = np.flatnonzero(at_points.any(axis=0)[boxes:])
+        rows = np.concatenate([self.lower_index, self.upper_index])[sides]
+        return np.unique(rows), int(at_points.any(axis=1).argmax())
+
     @property
     def arguments(self) -> tuple:
         """What the compiled functions below take as `limits`."""
@@ -139,7 +170,8 @@ class LimitRows:
 def row_values(z: Array, T: float, c: Array, limits: tuple, g: Array) -> None:
     """Write all rows g (K · R + 2,) from q, w, a (3, K, n), T and the constraints' rows c (K, m)."""
     middle, half_width, velocity, acceleration, lo, up, lower, upper, scale, free, shortest, longest, fixed = limits
-    _, K, n = z.shape
+    _, K, _ = z.shape
+    n = velocity.size
     R = (g.size - 2) // K
     for k in range(K):
         end = k == 0 or k == K - 1
@@ -183,22 +215,22 @@ def row_steps(dz: Array, dT: float, T: float, v: Array, jacobian: Array, limits:
     """
     _, half_width, velocity, acceleration, lo, up, _, _, scale, free, _, longest, fixed = limits
     _, K, n = dz.shape
-    m = jacobian.shape[1]
+    boxes, m = velocity.size, jacobian.shape[1]
     R = (dg.size - 2) // K
     dc = np.empty(m)
     du = np.empty(2 * n)
     for k in range(K):
         end = k == 0 or k == K - 1
         at = k * R
-        for j in range(n):
+        for j in range(boxes):
             q = 0.0 if end else dz[POSITION, k, j] / half_width[j]
             w = 0.0 if end else dz[RATE, k, j] / velocity[j]
             dT_here = 0.0 if end else dT
             dg[at + j] = q
-            dg[at + n + j] = -q
-            dg[at + 2 * n + j] = dT_here + w
-            dg[at + 3 * n + j] = dT_here - w
-        at += 4 * n
+            dg[at + boxes + j] = -q
+            dg[at + 2 * boxes + j] = dT_here + w
+            dg[at + 3 * boxes + j] = dT_here - w
+        at += 4 * boxes
         for j in range(acceleration.size):
             a = dz[CURVATURE, k, j] / acceleration[j]
             dg[at + j] = 2 * T * dT + a
@@ -264,18 +296,18 @@ def rows_transposed(y: Array, T: float, v: Array, jacobian: Array, limits: tuple
     """
     _, half_width, velocity, acceleration, _, _, _, _, _, _, _, longest, fixed = limits
     _, K, n = dual.shape
-    m = jacobian.shape[1]
+    boxes, m = velocity.size, jacobian.shape[1]
     R = (y.size - 2) // K
     by_T = 0.0
     by_u = np.empty(2 * n)
     for k in range(K):
         at = k * R
         if 0 < k < K - 1:
-            for j in range(n):
-                dual[POSITION, k, j] += (y[at + j] - y[at + n + j]) / half_width[j]
-                dual[RATE, k, j] += (y[at + 2 * n + j] - y[at + 3 * n + j]) / velocity[j]
-                by_T += y[at + 2 * n + j] + y[at + 3 * n + j]
-        at += 4 * n
+            for j in range(boxes):
+                dual[POSITION, k, j] += (y[at + j] - y[at + boxes + j]) / half_width[j]
+                dual[RATE, k, j] += (y[at + 2 * boxes + j] - y[at + 3 * boxes + j]) / velocity[j]
+                by_T += y[at + 2 * boxes + j] + y[at + 3 * boxes + j]
+        at += 4 * boxes
         for j in range(acceleration.size):
             dual[CURVATURE, k, j] += (y[at + j] - y[at + n + j]) / acceleration[j]
             by_T += 2 * T * (y[at + j] + y[at + n + j])

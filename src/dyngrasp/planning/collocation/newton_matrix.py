@@ -101,7 +101,7 @@ def assemble(
     for k in range(K):
         end = k == 0 or k == K - 1
         at = k * R
-        boxes = at + 4 * n + 2 * acceleration.size
+        boxes = at + 4 * velocity.size + 2 * acceleration.size
 
         for i in range(m):
             row_stiffness[i] = 0.0
@@ -143,7 +143,7 @@ def assemble(
             aT[i] = aT[i] / T2 + 2.0 / (T2 * T) * by_v[i] - 6.0 * effort / T * a
             aa[i, i] += 2.0 * effort + shift
             corner += 12.0 * effort / T2 * a * a
-            if end:
+            if end or velocity.size == 0:
                 ww[i], wT[i] = 0.0, 0.0
                 continue
             qq[i, i] += (omega[at + i] + omega[at + n + i]) / half_width[i] ** 2

@@ -8,6 +8,7 @@ from dyngrasp.planning.collocation import banded, limit_rows, newton_matrix, thr
 from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import NodeFunctions
 from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, ThreeTap
+from dyngrasp.planning.collocation.window import Window
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
 
@@ -43,14 +44,29 @@ class PhaseModel:
     """
 
     def __init__(
-        self, problem: PhaseProblem, functions: list[NodeFunctions], limits: LimitRows, work: WorkArrays
+        self,
+        problem: PhaseProblem,
+        functions: list[NodeFunctions],
+        limits: LimitRows,
+        work: WorkArrays,
+        window: Window | None = None,
     ) -> None:
+        """A problem, or a window of it with those of its constraints that `functions` and `limits` are of."""
         self.problem, self.functions, self.limits, self.work = problem, functions, limits, work
-        self.map = ThreeTap.of(problem)
+        if window is None:
+            self.map, self.effort_weight = ThreeTap.of(problem), problem.effort_weight
+            self.parameters = tuple(constraint.parameters for constraint in problem.constraints)
+        else:
+            self.map, self.effort_weight, self.parameters = window.map, window.effort_weight, window.parameters
         self.factor = 1.0
         self.corner = self.complement = np.nan
         self._arguments = limits.arguments
         self._T = 1.0
+
+    @property
+    def intervals(self) -> int:
+        """Intervals between the grid points of the model."""
+        return self.work.v.shape[0] - 1
 
     @property
     def rows(self) -> int:
@@ -67,11 +83,11 @@ class PhaseModel:
         """Move to a point, write its rows g, and return the objective."""
         self._place(x, T)
         work, column = self.work, 0
-        for constraint, function in zip(self.problem.constraints, self.functions, strict=True):
-            function.values(work.z[POSITION], work.v, constraint.parameters, work.c, column)
+        for parameters, function in zip(self.parameters, self.functions, strict=True):
+            function.values(work.z[POSITION], work.v, parameters, work.c, column)
             column += function.rows
         limit_rows.row_values(work.z, T, work.c, self._arguments, g)
-        return newton_matrix.objective(work.z[CURVATURE], T, self.problem.effort_weight)
+        return newton_matrix.objective(work.z[CURVATURE], T, self.effort_weight)
 
     def violation_at_the_ends(self) -> tuple[float, str]:
         """Worst violation of rows that the boundary positions alone decide, at the current point, and their name."""
@@ -93,11 +109,11 @@ class PhaseModel:
         work, column = self.work, 0
         limit_rows.constraint_weights(multiplier, self._arguments, work.weights)
         work.hessian[:] = 0.0
-        for constraint, function in zip(self.problem.constraints, self.functions, strict=True):
+        for parameters, function in zip(self.parameters, self.functions, strict=True):
             function.derivatives(
                 work.z[POSITION],
                 work.v,
-                constraint.parameters,
+                parameters,
                 work.weights,
                 work.c,
                 work.jacobian,
@@ -106,7 +122,7 @@ class PhaseModel:
             )
             column += function.rows
         limit_rows.row_values(work.z, T, work.c, self._arguments, g)
-        return newton_matrix.objective(work.z[CURVATURE], T, self.problem.effort_weight)
+        return newton_matrix.objective(work.z[CURVATURE], T, self.effort_weight)
 
     def descent(self, y: Array, out: Array) -> float:
         """Write −∇f + Jᵀ y by x into `out` (N−1, n), return it by T."""
@@ -114,7 +130,7 @@ class PhaseModel:
         work.dual[:] = 0.0
         limit_rows.constraint_weights(y, self._arguments, work.y_weights)
         by_T = limit_rows.rows_transposed(y, self._T, work.v, work.jacobian, self._arguments, work.y_weights, work.dual)
-        rho = self.problem.effort_weight
+        rho = self.effort_weight
         by_T += newton_matrix.add_objective_gradient(work.z[CURVATURE], self._T, rho, -self.factor, work.dual)
         return by_T + three_tap.pull_back(tap.first, tap.taps, tap.slope, work.dual, out)
 
@@ -137,7 +153,7 @@ class PhaseModel:
             work.jacobian,
             work.hessian,
             self._arguments,
-            self.problem.effort_weight,
+            self.effort_weight,
             self.factor,
             curvature,
             shift,

@@ -21,6 +21,7 @@ from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import InterpretedNodeFunctions, NodeFunctions, node_functions
 from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
 from dyngrasp.planning.collocation.three_tap import CURVATURE
+from dyngrasp.planning.collocation.window import EARLIEST, LATEST, STANDING_FOR, Window
 from dyngrasp.planning.problem import MIN_INTERVALS, NodeConstraint, PhaseProblem, Solution, Status
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
@@ -39,6 +40,7 @@ class StructuredSettings:
         time_limit: Wall time for one phase (s); after it the best iterate is returned.
         initial_barrier: Barrier parameter of a cold start, relative to the objective.
         guess_barrier: The same where a guess is given: a larger one would drive it away.
+        window_barrier: The same where only the end of the motion is sought, under few rows.
     """
 
     tolerance: float = 1e-8
@@ -47,6 +49,7 @@ class StructuredSettings:
     time_limit: float = 5.0
     initial_barrier: float = 1e-3
     guess_barrier: float = 1e-4
+    window_barrier: float = 1e-5
 
 
 _STATUS = {
@@ -103,7 +106,7 @@ class StructuredSolver:
         began = time.perf_counter()
         settings = self.settings
         limits = LimitRows.of(problem, functions)
-        work, method = self._kept(problem, limits)
+        work, method = self._kept(problem.intervals + 1, problem.joints, limits)
         model = PhaseModel(problem, functions, limits, work)
         g = np.empty(model.rows)
         optimum = closed_form.unconstrained_optimum(problem)
@@ -128,11 +131,20 @@ class StructuredSolver:
         start = closed_form.within_speed_limits(problem, T) if guess is None else on_grid(problem, guess)
         known = self._multipliers(guess, problem.intervals, limits.rows_per_point)
         barrier = settings.initial_barrier if guess is None else settings.guess_barrier
-        deadline = began + settings.time_limit
+        deadline, cautious = began + settings.time_limit, guess is not None and known is None
+        if known is None:
+            narrow = self._solve_window(model, g, start, deadline, cautious)
+            if narrow is not None:
+                trajectory, multipliers, iterations = narrow
+                objective = model.values(model.map.unknowns(trajectory), trajectory.duration, g)
+                violation, _ = limits.violation(g, trajectory.duration)
+                if violation <= settings.violation_tolerance:
+                    self._remember(trajectory, multipliers, limits.rows_per_point)
+                    timings["total"] = 1e3 * (time.perf_counter() - began)
+                    message = f"{problem.name}: optimal, limits active at the end only"
+                    return Solution(Status.CONVERGED, trajectory, objective, iterations, violation, timings, message)
         x, T = model.map.unknowns(start), start.duration
-        outcome, best, iterations = method.solve(
-            model, x, T, deadline, barrier, known, cautious=guess is not None and known is None
-        )
+        outcome, best, iterations = method.solve(model, x, T, deadline, barrier, known, cautious)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
@@ -148,9 +160,50 @@ class StructuredSolver:
         timings["total"] = 1e3 * (time.perf_counter() - began)
         return Solution(_STATUS[outcome], trajectory, objective, iterations, violation, timings, message)
 
-    def _kept(self, problem: PhaseProblem, limits: LimitRows) -> tuple[WorkArrays, InteriorPoint]:
+    def _solve_window(
+        self, model: PhaseModel, g: Array, start: Trajectory, deadline: float, cautious: bool
+    ) -> tuple[Trajectory, Array, int] | None:
+        """The optimum under those constraints alone that g violates, late and by its positions; None if that is not so.
+
+        Returns:
+            The motion, the multipliers of all rows of the model if it satisfies them, and the iterations.
+        """
+        problem, limits = model.problem, model.limits
+        violated = limits.violated_rows(g, self.settings.violation_tolerance)
+        if violated is None or limits.free_at_ends[violated[0]].any():
+            return None
+        step = max(problem.intervals // 10, 1)
+        first = step * (violated[1] // step - 1)
+        if not EARLIEST <= first <= problem.intervals - LATEST:
+            return None
+        owner = np.repeat(np.arange(len(model.functions)), [function.rows for function in model.functions])
+        chosen = np.unique(owner[violated[0]])
+        constraints = [problem.constraints[i] for i in chosen]
+        functions = [model.functions[i] for i in chosen]
+        window = Window.of(problem, model.map, constraints, first)
+        inside = LimitRows.without_boxes(problem, constraints, functions)
+        work, method = self._kept(window.map.first.size, problem.joints, inside)
+        part = PhaseModel(problem, functions, inside, work, window)
+        x = window.unknowns(model.map.unknowns(start))
+        outcome, best, iterations = method.solve(
+            part, x, start.duration, deadline, self.settings.window_barrier, None, cautious
+        )
+        if outcome is not Outcome.OPTIMAL:
+            return None
+        curvature = window.curvature(problem, best.x, best.T)
+        trajectory = closed_form.nearest_trajectory(problem, curvature, best.T)
+        multipliers = np.zeros(model.rows)
+        at_points = multipliers[:-2].reshape(-1, limits.rows_per_point)
+        columns = np.isin(np.concatenate([owner[limits.lower_index], owner[limits.upper_index]]), chosen)
+        boxes = limits.rows_per_point - columns.size
+        at_points[first:, boxes + np.flatnonzero(columns)] = method.multiplier[:-2].reshape(-1, inside.rows_per_point)[
+            STANDING_FOR:
+        ]
+        return trajectory, multipliers, iterations
+
+    def _kept(self, points: int, joints: int, limits: LimitRows) -> tuple[WorkArrays, InteriorPoint]:
         """Arrays of this problem size; those used longest ago make room."""
-        size = (problem.intervals + 1, problem.joints, limits.constraint_rows, limits.rows_per_point)
+        size = (points, joints, limits.constraint_rows, limits.rows_per_point)
         kept = self._methods.pop(size, None)
         if kept is None:
             settings = self.settings

@@ -1,0 +1,88 @@
+"""The last part of a phase as a problem of its own, for rows that are active there alone.
+
+Where no row is active the motion between two states is the one of least effort. All grid points before k0 can so be
+eliminated: whatever r[k0−1] and r[k0] are (`three_tap`), the least Σ_{k<k0} |a_k|² of a joint is
+
+    eᵀ C e,      e = (r[k0−1], r[k0]) less the same of coasting from the start,      C = (M Mᵀ)⁻¹, (2, 2),
+
+with e = M (a_0, …, a_{k0−1}). It enters the window as two grid points more, of the accelerations Lᵀ e with C = L Lᵀ and
+of no other effect. What solves the whole phase so solves the window, with a number of unknowns that depends on its
+length alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, TAPS, ThreeTap
+from dyngrasp.planning.problem import NodeConstraint, PhaseProblem
+from dyngrasp.signals import Array
+
+EARLIEST, LATEST = 3, 5  # the window begins at this grid point or later, and at this one before the last or earlier
+STANDING_FOR = 2  # grid points that stand for all before the window
+
+
+@dataclass(frozen=True)
+class Window:
+    """The grid points from `first` on.
+
+    Attributes:
+        first: k0.
+        map: From the unknowns of the window to q, w, a at its grid points, after the two that stand for the others.
+        parameters: Of each constraint at the same grid points.
+        effort_weight: ρ, for the sum over this number of grid points.
+    """
+
+    first: int
+    map: ThreeTap
+    parameters: tuple[Array, ...]
+    effort_weight: float
+
+    @classmethod
+    def of(cls, problem: PhaseProblem, whole: ThreeTap, constraints: list[NodeConstraint], first: int) -> Window:
+        """The window of a problem, `whole` its map, with some of its constraints."""
+        N, n = problem.intervals, problem.joints
+        points = STANDING_FOR + N + 1 - first
+        _, factor, _ = _before(N, first)
+        at = (np.array([first - 1, first]) / N)[:, None]
+        index = np.zeros(points, dtype=np.intp)
+        index[STANDING_FOR:] = whole.first[first:] - (first - 2)
+        taps, offset, slope = np.zeros((points, TAPS, 3)), np.empty((3, points, n)), np.zeros((3, points, n))
+        taps[STANDING_FOR:] = whole.taps[first:]
+        offset[:, STANDING_FOR:], slope[:, STANDING_FOR:] = whole.offset[:, first:], whole.slope[:, first:]
+        # Their position is that of the first grid point of the window, so that rows hold there if they hold here.
+        taps[:STANDING_FOR, :, POSITION] = whole.taps[first, :, POSITION]
+        offset[:, :STANDING_FOR] = 0.0
+        offset[POSITION, :STANDING_FOR] = whole.offset[POSITION, first]
+        taps[:STANDING_FOR, :2, CURVATURE] = factor.T
+        offset[CURVATURE, :STANDING_FOR] = -factor.T @ np.tile(problem.start_position, (2, 1))
+        slope[CURVATURE, :STANDING_FOR] = -factor.T @ (at * problem.start_velocity)
+        parameters = tuple(c.parameters[[first, first, *range(first, N + 1)]] for c in constraints)
+        weight = problem.effort_weight * (points - 1) / N
+        return cls(first, ThreeTap(index, taps, offset, slope), parameters, weight)
+
+    def unknowns(self, x: Array) -> Array:
+        """Those of the window among the unknowns (N−1, n) of the whole phase."""
+        return x[self.first - 2 :]
+
+    def curvature(self, problem: PhaseProblem, x: Array, T: float) -> Array:
+        """(N+1, n) accelerations in normalised time of the whole phase, from the unknowns of the window."""
+        N = problem.intervals
+        matrix, _, C = _before(N, self.first)
+        at = (np.array([self.first - 1, self.first]) / N)[:, None]
+        e = x[:2] - problem.start_position - at * T * problem.start_velocity
+        inside = self.map.expand(x, T)[CURVATURE, STANDING_FOR:]
+        return np.vstack([matrix.T @ (C @ e), inside])
+
+
+@lru_cache(maxsize=64)
+def _before(intervals: int, first: int) -> tuple[Array, Array, Array]:
+    """(2, k0) M, (2, 2) L and C."""
+    i = np.arange(first)
+    rows = [np.where(i > 0, np.maximum(m - i, 0.0), m / 2 - 0.25) for m in (first - 1, first)]
+    matrix = np.array(rows) / intervals**2
+    C = np.linalg.inv(matrix @ matrix.T)
+    return matrix, np.linalg.cholesky(C), C
