@@ -53,6 +53,7 @@ _COLUMNS = {
     },
     **dict.fromkeys(("tracking_rms_rad", "tracking_max_rad", "tracking_at_grasp_rad", "clamp_delay_s"), pa.float64()),
     "slip_from_grasp_point_mm": pa.float64(),
+    **dict.fromkeys(("replans", "published", "too_uncertain"), pa.int64()),
 }
 SCHEMA = pa.schema(list(_COLUMNS.items()))
 """Columns of a study's table; what a trial did not get to is null."""

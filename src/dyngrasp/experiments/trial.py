@@ -238,6 +238,7 @@ def study_row(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> 
     row |= {f"passed_{name}": verdict for name, verdict in passed.items()}
     row |= {f"worst_{name}": ratio for name, ratio in document["worst"].items()}
     row |= document["tracking"]
+    row |= {key: document["replanning"].get(key) for key in ("replans", "published", "too_uncertain")}
     row["trial_ms"] = 1e3 * (time.perf_counter() - began)
     return row
 

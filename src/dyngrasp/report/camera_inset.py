@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.perception.marker_drawing import outlined
-from dyngrasp.perception.part_tracker import FrameReport
+from dyngrasp.perception.pose_filter import Verdict
 
 Frame = NDArray[np.uint8]
 
@@ -43,6 +43,8 @@ class CameraInset:
         self._pictures = vision.pictures
         self._kept = sorted(vision.pictures)
         self._times = [self._reports[k].frame.t_receipt for k in self._kept]
+        taken = (k for k, report in enumerate(self._reports) if report.verdict in (Verdict.ACCEPTED, Verdict.ACQUIRED))
+        self._first_taken = next(taken, len(self._reports))
         self._width = round(SHARE * video_width)
         self._margin = round(MARGIN * video_width)
         self._panel = lru_cache(maxsize=2)(self._draw)
@@ -64,17 +66,17 @@ class CameraInset:
     def _draw(self, number: int) -> Frame:
         report = self._reports[number]
         picture = outlined(self._pictures[number], report.frame.markers, self._width, _ORANGE)
-        panel = np.vstack([picture, _lettered(_caption(report), self._width)])
+        panel = np.vstack([picture, _lettered(self._caption(number), self._width)])
         return np.pad(panel, ((_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0)), constant_values=_BORDER_GREY)
 
-
-def _caption(report: FrameReport) -> str:
-    count = len(report.frame.markers)
-    seen = f"{count} marker{'s' if count > 1 else ''}" if count else "no marker"
-    if report.estimate is None:
-        return f"camera on the hand: {seen}"
-    deviation = 1e3 * np.sqrt(np.linalg.eigvalsh(report.estimate.covariance[:3, :3])[-1])
-    return f"camera on the hand: {seen}\npart known to ± {deviation:.1f} mm"
+    def _caption(self, number: int) -> str:
+        report = self._reports[number]
+        count = len(report.frame.markers)
+        seen = f"{count} marker{'s' if count > 1 else ''}" if count else "no marker"
+        if report.estimate is None or number < self._first_taken:
+            return f"camera on the hand: {seen}\npart not recognised yet"
+        deviation = 1e3 * np.sqrt(np.linalg.eigvalsh(report.estimate.covariance[:3, :3])[-1])
+        return f"camera on the hand: {seen}\npart known to ± {deviation:.1f} mm"
 
 
 @lru_cache(maxsize=64)
