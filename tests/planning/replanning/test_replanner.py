@@ -243,6 +243,32 @@ def test_a_moving_part_is_met_where_it_will_be(local, plan, targets, task):
         assert abs(result.plan.phase_ends[1] - result.targets.grasp_time) < 1e-4
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.06])
+def test_a_fresh_plan_is_made_for_the_newest_pose_whatever_the_last_plan_was_for(complete, plan, targets, task, speed):
+    """A part that was believed to move turns up elsewhere, turned by half a turn: only a fresh plan reaches it."""
+    first = complete.replan_to_pose(
+        plan,
+        targets,
+        estimate(displaced(targets.T_world_object, 0.0, -0.1, 0.0), 0.1, np.array([0, 0.02, 0, 0, 0, 0.0])),
+        0.1,
+    )
+    assert first.ok, first.message
+    assert first.targets.moving
+    twist, t, published = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0]), 0.4, 0
+    for y in (-0.04, -0.07, -0.1):
+        T = displaced(targets.T_world_object, -0.03, y, 2.9)
+        result = complete.replan_to_pose(first.plan, first.targets, estimate(T, t, twist), t)
+        if not result.ok:
+            continue
+        assert result.path is Path.FRESH
+        check_published(result, first.plan, task)
+        met = result.plan.phase_ends[1] if speed else t
+        expected = T.translation + (met - t) * twist[:3]
+        np.testing.assert_allclose(result.targets.T_world_object.translation, expected, atol=1e-9)
+        published += 1
+    assert published
+
+
 @pytest.mark.parametrize("left", [0.8, 0.45, 0.25, 0.15])
 def test_moves_late_in_the_approach_are_followed(complete, plan, targets, task, left):
     """Two centimetres beside a funnel of some millimetres: the hand goes back above the part, or stretches its way."""

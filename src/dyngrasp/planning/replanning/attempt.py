@@ -53,8 +53,7 @@ class Attempt:
         self.previous = previous
         updater, twist = target_updater(self.task), estimate.twist_world
         plan, targets = self.plan, previous
-        # A slower part than this moves less than `settled` while the grasp time changes by a second.
-        moving = bool(np.abs(twist).max() > self.settings.settled)
+        moving = self._moves(estimate)
         grasp_time = float(plan.phase_ends[GRASP])
         for _ in range(8 if moving else 1):
             started = time.perf_counter()
@@ -193,7 +192,7 @@ class Attempt:
     ) -> GraspPlan | None:
         """Solve what the audit refuses, and audit again, until it refuses nothing or nothing is left to be done.
 
-        Between its grid points a motion may pass the funnel's wall; then the wall is moved by as much as that was.
+        Between its grid points a motion may pass the wall of the funnel; then the wall is moved by a little more than that.
         """
         assert self.full is not None
         assert self.report is not None
@@ -205,7 +204,7 @@ class Attempt:
                 break
             through_wall = [entry for entry in self.report.failures if entry.name == "funnel"]
             if APPROACH in solved and through_wall:
-                problems = (raised(problems[APPROACH], -1.2 * through_wall[0].worst), *problems[1:])
+                problems = (raised(problems[APPROACH], 0.002 - 1.2 * through_wall[0].worst), *problems[1:])
             elif refused <= solved:
                 break
             started = time.perf_counter()
@@ -237,9 +236,10 @@ class Attempt:
             return self._kept(status, targets, "fresh plan: the hand is not open and at rest")
         started = time.perf_counter()
         try:
-            if not targets.moving:
-                T = targets.T_world_object if estimate is None else estimate.T_world_object
-                targets = grasp_targets(T, self.task, state.arm.position)
+            if estimate is not None:
+                targets = self._fresh_targets(estimate, state, left)
+            elif not targets.moving:
+                targets = grasp_targets(targets.T_world_object, self.task, state.arm.position)
         except (OutOfReach, GraspRefused) as error:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
@@ -261,6 +261,23 @@ class Attempt:
         if fresh is None:
             return self._kept(Status.AUDIT_FAILED, targets, "")
         return self._published(fresh, targets, Path.FRESH, budget)
+
+    def _fresh_targets(self, estimate: PoseEstimate, state: PlanSample, left: float) -> GraspTargets:
+        """Targets that owe nothing to the running plan; a moving part is met when a new approach can be there."""
+        assert self.full is not None
+        T, twist, q = estimate.T_world_object, estimate.twist_world, state.arm.position
+        if not self._moves(estimate):
+            return grasp_targets(T, self.task, q)
+        age, grasp_duration = state.arm.t - estimate.t_capture, float(self.plan.durations[GRASP])
+        standing = grasp_targets(moved(T, twist, age + left + grasp_duration), self.task, q)
+        until_grasp = (self.full.approach_time(state, standing) or left) + grasp_duration
+        return target_updater(self.task).update(
+            standing, moved(T, twist, age + until_grasp), twist, state.arm.t + until_grasp, grasp_duration
+        )
+
+    def _moves(self, estimate: PoseEstimate) -> bool:
+        # A slower part than this moves less than `settled` while the grasp time changes by a second.
+        return bool(np.abs(estimate.twist_world).max() > self.settings.settled)
 
     def _late(self, budget: float) -> bool:
         return self.clock() - self.began > budget

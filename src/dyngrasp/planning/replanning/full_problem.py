@@ -20,8 +20,9 @@ from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, hold
 from dyngrasp.signals import Array, JointState
 from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory
 
-# The funnel is lifted in full after this share of the approach, and until as much before its end.
-_LIFTED = 0.15
+# The funnel is lifted in full after this share of the approach, and until as much before its end; at the end itself by
+# this much (m): the pre-grasp stands 20 mm above its tip.
+_RAMP, _LIFT_AT_END = 0.15, 0.012
 
 
 class PhasePlanner(Protocol):
@@ -73,6 +74,15 @@ class FullProblem:
         shortest = problems[APPROACH].min_duration
         longest = max(min(problems[APPROACH].max_duration, left + self.detour), shortest)
         return (replace(problems[APPROACH], constraints=rows, max_duration=longest), *problems[1:]), ""
+
+    def approach_time(self, state: PlanSample, targets: GraspTargets) -> float | None:
+        """How long about an approach takes that comes down the funnel (s); None where that cannot be told."""
+        try:
+            problem = self.planner.phase_problems(state.arm, targets, state.gripper.position, state.arm.t)[APPROACH]
+        except DyngraspError:
+            return None
+        guess = self.planner.guess(problem, targets)
+        return None if guess is None else guess.duration
 
     def descent(
         self, plan: GraspPlan, problem: PhaseProblem, state: PlanSample, targets: GraspTargets
@@ -149,8 +159,8 @@ class FullProblem:
 
 
 def raised(problem: PhaseProblem, by: float) -> PhaseProblem:
-    """The approach with the tip of its funnel lifted by a height (m), but at both ends, which are given."""
+    """The approach with its funnel lifted by a height (m), but as far as both ends, which are given, allow."""
     s = np.linspace(0.0, 1.0, problem.intervals + 1)
-    lift = by * np.clip(np.minimum(s, 1.0 - s) / _LIFTED, 0.0, 1.0)
+    lift = np.minimum(by * np.clip(s / _RAMP, 0.0, 1.0), _LIFT_AT_END + by * np.clip((1.0 - s) / _RAMP, 0.0, 1.0))
     rows = tuple(lifted(row, lift) if row.name == "funnel" else row for row in problem.constraints)
     return replace(problem, constraints=rows)
