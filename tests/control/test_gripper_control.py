@@ -60,7 +60,7 @@ def test_holds_the_fingers_against_their_weight(gripper, closed):
 
 def test_squeeze_ramps_up_once_both_pads_feel_the_part(gripper, closed):
     settings = GripperControlSettings(over_close=0.0)
-    controller = GripperController(gripper, 1e-3, settings)
+    controller = GripperController(gripper, 1e-3, settings=settings)
     still = command(controller, gripper, closed)
     assert not controller.squeezing
     one = command(controller, gripper, closed, t=0.010, force=(2.0, 0.0))
@@ -74,8 +74,26 @@ def test_squeeze_ramps_up_once_both_pads_feel_the_part(gripper, closed):
     np.testing.assert_allclose(levels, expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("tilt", [-0.7, 0.4])
+def test_one_pad_presses_more_where_the_part_would_slide_sideways(gripper, closed, tilt):
+    """Of a hand tilted about x the upper pad is relieved by what the lower one carries more; together it is m g."""
+    mass, g = 0.6, 9.81
+    tilted = g * np.array([0.0, np.sin(tilt), -np.cos(tilt)])
+    forces = []
+    for held_mass in (0.0, mass):
+        controller = GripperController(gripper, 1e-3, held_mass, GripperControlSettings(over_close=0.0))
+        weight = command(controller, gripper, closed, phase="approach", specific_force=tilted)
+        for t in (0.0, 1.0):
+            torque = command(controller, gripper, closed, t=t, force=(2.0, 2.0), specific_force=tilted)
+        forces.append(pad_forces(gripper, closed, torque - weight))
+    empty, loaded = forces
+    # The first pad presses against the closing axis, y; the part's reaction to gravity points along `tilted`.
+    change = mass * tilted[1] / 2
+    np.testing.assert_allclose(loaded - empty, [-change, change], rtol=1e-4)
+
+
 def test_squeeze_presses_both_pads_alike(gripper, closed):
-    controller = GripperController(gripper, 1e-3, GripperControlSettings(over_close=0.0))
+    controller = GripperController(gripper, 1e-3, settings=GripperControlSettings(over_close=0.0))
     weight = command(controller, gripper, closed, t=0.0, phase="approach")
     command(controller, gripper, closed, t=0.0, force=(2.0, 2.0))
     squeeze = command(controller, gripper, closed, t=1.0, force=(2.0, 2.0)) - weight
@@ -88,7 +106,7 @@ def test_squeeze_presses_both_pads_alike(gripper, closed):
 
 def test_first_touch_closes_further_by_what_was_set(gripper, closed):
     settings = GripperControlSettings(force_fraction=1e-9)
-    controller = GripperController(gripper, 1e-3, settings)
+    controller = GripperController(gripper, 1e-3, settings=settings)
     step = controller._over_closing(closed)
     assert gripper.aperture(closed) - gripper.aperture(closed + step) == pytest.approx(
         2 * settings.over_close, rel=0.01

@@ -57,7 +57,7 @@ def grasp_controller(
         task.robot,
         task.gripper,
         ComputedTorque(task.robot_empty, task.robot_loaded(grasp), control_period, arm),
-        GripperController(task.gripper, control_period, hand),
+        GripperController(task.gripper, control_period, task.grasp_object.mass, hand),
     )
 
 

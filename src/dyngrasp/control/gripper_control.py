@@ -45,18 +45,22 @@ class GripperController:
 
     From the first touch of a pad on, the planned gap is reduced by `over_close` on each side, so that the other pad
     comes to the part too. Once every pad feels it, a feed-forward that presses the pads together along the closing axis
-    ramps up. Both begin when the planned closing has ended, whatever the pads feel. Torques never pass the limits of
-    the hand.
+    ramps up. Both begin when the planned closing has ended, whatever the pads feel. What the held part asks for along
+    the closing axis, its weight where the hand is tilted, is fed forward too: one pad presses more, the other less.
+    Torques never pass the limits of the hand.
 
     Args:
         gripper: The hand.
         dt: Control period (s).
+        held_mass: What the part is believed to weigh (kg).
         settings: Gains and forces.
     """
 
-    def __init__(self, gripper: GripperModel, dt: float, settings: GripperControlSettings | None = None) -> None:
+    def __init__(
+        self, gripper: GripperModel, dt: float, held_mass: float = 0.0, settings: GripperControlSettings | None = None
+    ) -> None:
         self.settings = settings or GripperControlSettings()
-        self._gripper = gripper
+        self._gripper, self._held_mass = gripper, held_mass
         self._model = pin.Model(gripper.pin_model)
         self._data = self._model.createData()
         self._columns = np.array([self._model.joints[self._model.getJointId(j)].idx_v for j in gripper.joint_names])
@@ -93,7 +97,7 @@ class GripperController:
         if self._touch_since is not None:
             target = target + self._share(self._touch_since, sample.gripper.t) * self._over_closing(target)
         if self._squeeze_since is not None:
-            squeeze = self._share(self._squeeze_since, sample.gripper.t) * self._squeeze_torque(q)
+            squeeze = self._share(self._squeeze_since, sample.gripper.t) * self._squeeze_torque(q, specific_force)
         error = target - q
         error_rate = self._planned.update(target) - self.velocity
         feedback = s.bandwidth**2 * error + 2 * s.damping * s.bandwidth * error_rate
@@ -123,20 +127,30 @@ class GripperController:
         slope = (gripper.aperture(posture + small * direction) - gripper.aperture(posture)) / small
         return direction * (-2 * self.settings.over_close / slope)
 
-    def _squeeze_torque(self, q: Array) -> Array:
-        """(m,) J_padᵀ F: presses both pads together, the weakest joint at `force_fraction` of its limit."""
+    def _squeeze_torque(self, q: Array, specific_force: Array) -> Array:
+        """(m,) J_padᵀ F: presses both pads together, the weakest joint at `force_fraction` of its limit.
+
+        The difference of the two forces carries the part along the closing axis.
+        """
         gripper = self._gripper
+        first, second = self._torque_per_newton(q)
+        scale = self.settings.force_fraction / np.max(np.abs(first + second) / gripper.torque)
+        force = min(scale, gripper.pinch_force)
+        # The first pad presses against the closing axis.
+        sideways = self._held_mass * float(specific_force @ gripper.closing_axis) / 2
+        return (force - sideways) * first + (force + sideways) * second
+
+    def _torque_per_newton(self, q: Array) -> list[Array]:
+        """For each pad the (m,) torques that press it with 1 N along the closing axis, towards the other one."""
+        gripper, torques = self._gripper, []
         pin.computeJointJacobians(self._model, self._data, gripper.full_configuration(q))
         pin.updateFramePlacements(self._model, self._data)
-        torque = np.zeros(gripper.m)
         for side, frame in zip((-1.0, 1.0), gripper.pad_ids, strict=True):
             inward = side * gripper.closing_axis
             J = pin.getFrameJacobian(self._model, self._data, frame, pin.LOCAL_WORLD_ALIGNED)[:, self._columns]
             # The pads touch at the foot of their arcs on the part: arc centre plus radius along the closing axis.
-            J_contact = J[:3] - pin.skew(gripper.pad_radius * inward) @ J[3:]
-            torque += J_contact.T @ inward
-        scale = self.settings.force_fraction / np.max(np.abs(torque) / gripper.torque)
-        return torque * min(scale, gripper.pinch_force)
+            torques.append((J[:3] - pin.skew(gripper.pad_radius * inward) @ J[3:]).T @ inward)
+        return torques
 
     def _weight(self, q: Array, specific_force: Array) -> Array:
         self._model.gravity.linear = -specific_force
