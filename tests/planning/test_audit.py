@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from dyngrasp.models.distance_bounds import Capsules
-from dyngrasp.planning.audit import SUBSTEPS, audit
+from dyngrasp.planning.audit import SUBSTEPS, audit, standstill
 from dyngrasp.planning.clearance import cell_geometry
 from dyngrasp.planning.problem import AuditEntry
 from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
@@ -447,3 +447,26 @@ def test_entry_of_that_name_or_those_there_are(plan, targets, task):
     assert report["torque"].name == "torque"
     with pytest.raises(KeyError, match="funnel"):
         report["torqe"]
+
+
+def test_a_plan_that_stops_on_its_way_is_told_from_one_that_does_not(plan, task):
+    entry = standstill(plan, task)
+    assert entry.ok
+    # What the entry looks at every half grid step is on a finer grid no slower than a little.
+    times = np.linspace(
+        plan.start_time + 0.02 * plan.durations.sum(), plan.end_time - 0.02 * plan.durations.sum(), 5000
+    )
+    speeds = [np.abs(plan.sample(t).arm.velocity / task.robot.limits.velocity).max() for t in times]
+    assert entry.worst == pytest.approx(min(speeds), abs=2e-3)
+    assert np.abs(plan.sample(entry.time).arm.velocity / task.robot.limits.velocity).max() == pytest.approx(entry.worst)
+    # The same path on a clock τ(s) that starts and ends as it did but stands still at a quarter: τ' = 1 − sin 2πs.
+    arm = plan.arm[0]
+    s = np.linspace(0.0, 1.0, arm.intervals + 1)
+    rate, curvature = 1.0 - np.sin(2 * np.pi * s[:, None]), -2 * np.pi * np.cos(2 * np.pi * s[:, None])
+    q, w, v = arm.sample_many(arm.duration * (s + (np.cos(2 * np.pi * s) - 1.0) / (2 * np.pi)))
+    stopping = Trajectory(arm.duration, q, w * rate, v * rate**2 + w * curvature / arm.duration)
+    found = standstill(replace(plan, arm=(stopping, *plan.arm[1:])), task)
+    assert not found.ok
+    assert found.time == pytest.approx(plan.start_time + 0.25 * arm.duration, abs=arm.duration / arm.intervals)
+    # What is past does not count.
+    assert standstill(replace(plan, arm=(stopping, *plan.arm[1:])), task, plan.start_time + 0.5 * arm.duration).ok

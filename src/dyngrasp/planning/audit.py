@@ -35,6 +35,10 @@ SUBSTEPS = 16
 # there. An interval is looked into where four times that could break a constraint.
 CURVATURE_FACTOR = 4.0 / 8.0
 
+# An arm slower than this, in parts of its joints' speed limits, has come to a standstill: half as much again as what is
+# called one when an episode is judged, for tracking is not exact. At both ends of a plan this part of it may be slower.
+LEAST_SPEED, AT_REST = 0.015, 0.02
+
 # Rounding of a ratio to a limit after a solver that stops at 1e-8 in its own scaling.
 RATIO_TOLERANCE = 1e-6
 
@@ -169,6 +173,33 @@ def audit(
         *clearance_entries(task, targets, waypoints_of(plan, since)),
     ]
     return AuditReport(tuple(entries))
+
+
+def standstill(plan: GraspPlan, task: GraspTask, since: float = -np.inf) -> AuditEntry:
+    """Whether the arm keeps moving until it puts the part down: the least max-norm of q̇/q̇max.
+
+    No entry of `audit`: a plan that stops on its way can be executed, only nobody who grasps in motion wants it. Looked
+    at is all but the first and last `AT_REST` of the plan, for it may begin at rest and ends so.
+
+    Args:
+        plan: Any plan.
+        task: Arm and its limits.
+        since: What comes before this time (s) is past.
+    """
+    span = AT_REST * (plan.end_time - plan.start_time)
+    first, last = max(since, plan.start_time + span), plan.end_time - span
+    slowest, time = np.inf, last
+    for arm, T in zip(plan.arm, plan.phase_ends.tolist(), strict=True):
+        w, v, step = arm.velocity, arm.acceleration, arm.duration / arm.intervals
+        halfway = (w[1:] + w[:-1]) / 2 - step / 8 * (v[1:] - v[:-1])
+        for velocity, times in ((w, arm.times), (halfway, arm.times[:-1] + step / 2)):
+            clock = T - arm.duration + times
+            inside = (clock >= first) & (clock <= last)
+            speed = np.where(inside, (np.abs(velocity) / task.robot.limits.velocity).max(axis=1), np.inf)
+            k = int(speed.argmin())
+            if speed[k] < slowest:
+                slowest, time = float(speed[k]), float(clock[k])
+    return AuditEntry("standstill", slowest, LEAST_SPEED, True, 0.0, "of limit", time)
 
 
 def _rows(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
 from dyngrasp.errors import GraspRefused, OutOfReach
-from dyngrasp.planning.audit import audit
+from dyngrasp.planning.audit import audit, standstill
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
 from dyngrasp.planning.problem import AuditReport, PhaseProblem, Status
 from dyngrasp.planning.replanning.full_problem import FullProblem, raised
@@ -148,12 +149,19 @@ class Attempt:
         shares, reaction = self.settings.recovery_shares, self.settings.reaction
         return funnel_recovery(self.plan, splice, targets, self.task, shares, reaction)
 
+    @cached_property
+    def _keeps_moving(self) -> bool:
+        """Whether the running plan does: then the new one must, too."""
+        return standstill(self.plan, self.task, self.splice).ok
+
     def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
         started = time.perf_counter()
         if self.recovery is None:
             report = audit(plan, targets, self.task, self.splice)
         else:
             report = audit(plan, targets, self.task, self.splice, self.recovery.wall(plan))
+        if self._keeps_moving:
+            report = AuditReport((*report.entries, standstill(plan, self.task, self.splice)))
         self._count("audit", started)
         return report
 
@@ -192,7 +200,7 @@ class Attempt:
     ) -> GraspPlan | None:
         """Solve what the audit refuses, and audit again, until it refuses nothing or nothing is left to be done.
 
-        Between its grid points a motion may pass the wall of the funnel; then the wall is moved by a little more than that.
+        Between its grid points a motion may pass the wall of the funnel; then that is moved by a little more.
         """
         assert self.full is not None
         assert self.report is not None
