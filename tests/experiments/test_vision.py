@@ -11,7 +11,7 @@ from dyngrasp.experiments.draws import draw_trial
 from dyngrasp.experiments.replanning import pose_source, replanning_loop
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.experiments.trial import plan_trial, planner_for
-from dyngrasp.experiments.vision import films, scenario_camera, tracker_settings
+from dyngrasp.experiments.vision import films, tracker_settings
 from dyngrasp.experiments.workcell import load_workcell
 from dyngrasp.perception.pose_track import MotionSettings
 from dyngrasp.signals import PoseEstimate
@@ -101,7 +101,7 @@ def test_pictures_are_taken_for_a_replanner_only():
 
 
 def test_the_camera_has_the_size_that_the_scenario_asks_for():
-    small = scenario_camera(workcell("camera_sdh2.toml").scenario)
+    small = workcell("camera_sdh2.toml").camera
     assert (small.width, small.height) == (640, 480)
-    own = scenario_camera(workcell("static_sdh2.toml", "pose.source=camera").scenario)
+    own = workcell("static_sdh2.toml").camera
     assert (own.width, own.height) == (1024, 1024)

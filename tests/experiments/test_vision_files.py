@@ -15,7 +15,7 @@ from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.errors import InputFileError, RenderingUnavailable
 from dyngrasp.experiments.output import OutputFolder
 from dyngrasp.experiments.scenario import load_scenario
-from dyngrasp.experiments.vision import recorded_poses, scenario_camera
+from dyngrasp.experiments.vision import recorded_poses
 from dyngrasp.experiments.vision_files import COLUMNS, perceive, write_pictures
 from dyngrasp.experiments.workcell import load_workcell
 from dyngrasp.perception.marker_detection import MarkerDetector
@@ -42,7 +42,7 @@ def workcell():
 def filmed(workcell):
     """The part under a moving hand, every second picture kept: the record, and where the part was."""
     task = workcell.task
-    camera = scenario_camera(workcell.scenario)
+    camera = workcell.camera
     spot = task.robot.forward_kinematics(ABOVE) * task.gripper.T_flange_hand * camera.T_hand_camera
     T_part = pin.SE3(pin.utils.rotate("z", 2.6), np.array([*spot.translation[:2], 0.1]))
     scene = build_scene(task.robot, task.gripper, task.grasp_object, markers=True)

@@ -18,7 +18,6 @@ from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.scenario import Scenario
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.models.camera import CameraModel
-from dyngrasp.models.catalogue import load_camera
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
 from dyngrasp.perception.part_tracker import PartTracker, PartTrackerSettings
@@ -56,11 +55,10 @@ def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene
 
     Raises:
         RenderingUnavailable: The machine cannot draw off screen.
-        UnknownName: No such camera.
         InvalidProblem: The part carries no markers.
     """
     section, task = workcell.scenario.camera, workcell.task
-    true = scenario_camera(workcell.scenario)
+    true = workcell.camera
     streams = np.random.SeedSequence(trial.seed, spawn_key=(_IMAGE_STREAM,)).spawn(2)
     believed = _misplaced(true, 1e-3 * section.mount_mm, np.deg2rad(section.mount_deg), streams[0])
     deviations = np.repeat([1e-3 * section.prior_mm, np.deg2rad(section.prior_deg)], 3)
@@ -89,20 +87,6 @@ def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene
     tracker = PartTracker(solver, task.robot, task.gripper, prior, tracker_settings(workcell.scenario))
     with CameraSensor(scene, true, imaging) as sensor:
         yield CameraPoses(sensor, detector, tracker, settings)
-
-
-def scenario_camera(scenario: Scenario) -> CameraModel:
-    """The camera of a scenario, with pictures of the size that it asks for.
-
-    Raises:
-        UnknownName: No such camera.
-        ModelFileError: Its file cannot be used.
-    """
-    section = scenario.camera
-    camera = load_camera(section.model)
-    if section.width is None or section.height is None:
-        return camera
-    return camera.scaled(section.width, section.height)
 
 
 def tracker_settings(scenario: Scenario) -> PartTrackerSettings:

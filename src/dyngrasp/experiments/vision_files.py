@@ -14,7 +14,7 @@ import pinocchio as pin
 from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.errors import InputFileError
 from dyngrasp.experiments.output import OutputFolder, atomic
-from dyngrasp.experiments.vision import scenario_camera, tracker_settings
+from dyngrasp.experiments.vision import tracker_settings
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
@@ -63,12 +63,11 @@ def perceive(
         InputFileError: A file is missing or cannot be used, or a picture is not of the camera's size.
         InvalidProblem: The part carries no markers.
     """
-    task, scenario = workcell.task, workcell.scenario
-    camera = scenario_camera(scenario)
+    task, camera = workcell.task, workcell.camera
     pictures = read_table(folder, task.robot.joint_names)
     detector = MarkerDetector(task.grasp_object)
     solver = MarkerPoseSolver(camera, task.grasp_object)
-    tracker = PartTracker(solver, task.robot, task.gripper, settings=tracker_settings(scenario))
+    tracker = PartTracker(solver, task.robot, task.gripper, settings=tracker_settings(workcell.scenario))
     for i, taken in enumerate(pictures):
         progress(i, len(pictures))
         pixels = read_picture(taken.path)

@@ -9,7 +9,8 @@ import numpy as np
 
 from dyngrasp.errors import ScenarioError
 from dyngrasp.experiments.scenario import Scenario
-from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
+from dyngrasp.models.camera import CameraModel
+from dyngrasp.models.catalogue import load_camera, load_gripper, load_object, load_robot
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.planning.grasp_targets import GraspTask
 from dyngrasp.signals import Array, read_only
@@ -23,11 +24,13 @@ class Workcell:
         scenario: As it was decoded.
         task: Arm, gripper, part, target configuration and settings.
         q_start: (n,) configuration in which the motion begins (rad).
+        camera: On the hand, with pictures of the size that the scenario asks for.
     """
 
     scenario: Scenario
     task: GraspTask
     q_start: Array
+    camera: CameraModel
 
 
 def load_workcell(scenario: Scenario, source: str | Path) -> Workcell:
@@ -49,7 +52,10 @@ def load_workcell(scenario: Scenario, source: str | Path) -> Workcell:
     q_start = _configuration(section.start_deg, "task.start_deg", robot, source)
     place = _configuration(section.place_deg, "task.place_deg", robot, source)
     task = GraspTask(robot, gripper, grasp_object, place, section.task_settings)
-    return Workcell(scenario, task, q_start)
+    camera = load_camera(scenario.camera.model)
+    if scenario.camera.width is not None and scenario.camera.height is not None:
+        camera = camera.scaled(scenario.camera.width, scenario.camera.height)
+    return Workcell(scenario, task, q_start, camera)
 
 
 def _configuration(degrees: tuple[float, ...], key: str, robot: RobotModel, source: str | Path) -> Array:
