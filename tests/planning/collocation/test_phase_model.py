@@ -86,11 +86,13 @@ def test_steps_of_rows(case):
     model.derivatives(x, T, multiplier, g)
     jacobian = differences(lambda x, T: rows_at(model, x, T), x, T)
     model.derivatives(x, T, multiplier, g)
-    for i in range(x.size + 1):
-        unit = np.zeros(x.size + 1)
-        unit[i] = 1.0
-        model.row_steps(unit[:-1].reshape(x.shape), unit[-1], dg)
-        np.testing.assert_allclose(dg, jacobian[:, i], atol=DIFFERENCE * np.abs(jacobian).max())
+    assert model.factorise(np.ones(model.rows), multiplier, 0.0, 50.0)
+    random, rhs, dx = np.random.default_rng(6), np.empty_like(x), np.empty_like(x)
+    for y in random.normal(size=(5, model.rows)):
+        dT, by_T, product = model.newton_step(y, rhs, dx, dg, np.inf)
+        step = np.append(dx.ravel(), dT)
+        np.testing.assert_allclose(dg, jacobian @ step, atol=DIFFERENCE * np.abs(jacobian).max() * np.abs(step).max())
+        assert product == pytest.approx(rhs.ravel() @ dx.ravel() + by_T * dT)
 
 
 def test_newton_matrix(case):
@@ -111,7 +113,7 @@ def test_newton_matrix(case):
     rhs = random.normal(size=(2, x.size + 1))
     for r in rhs:
         step = r[:-1].reshape(x.shape).copy()
-        step_T = model.solve(step, r[-1], np.inf)
+        step_T = model.solve(step, r[-1])
         residual = K @ np.append(step.ravel(), step_T) - r
         assert np.abs(residual).max() < 1e-4 * np.abs(r).max()
     assert np.linalg.eigvalsh((K + K.T) / 2)[0] > 0
@@ -148,4 +150,4 @@ def test_fixed_duration_takes_no_step(make_problem):
     multiplier = np.full(model.rows, 0.1)
     model.derivatives(x, 1.5, multiplier, np.empty(model.rows))
     assert model.factorise(multiplier, multiplier, 1.0, 0.0)
-    assert model.solve(x.copy(), 7.0, np.inf) == 0.0
+    assert model.solve(x.copy(), 7.0) == 0.0

@@ -259,12 +259,9 @@ class InteriorPoint:
         pair = (self.s, self.t, self.multiplier, self.price)
         aim = (mu, self.e_s, self.e_t, self.omega, self.y)
         rows.target_multipliers(*pair, *aim)
-        by_T = model.descent(self.y, self.rhs)
-        self.dx[:] = self.rhs
-        self.dT = model.solve(self.dx, by_T, LARGEST_CHANGE * self.T)
-        model.row_steps(self.dx, self.dT, self.dg)
+        self.dT, _, product = model.newton_step(self.y, self.rhs, self.dx, self.dg, LARGEST_CHANGE * self.T)
         rows.row_direction(self.dg, *pair, *aim, self.ds, self.dt, self.dmultiplier)
-        return float(np.vdot(self.rhs, self.dx)) + by_T * self.dT
+        return product
 
     def _lengths(self, keep: float) -> tuple[float, float]:
         """Lengths of the step of x, T and slacks, and of the step of the multipliers."""

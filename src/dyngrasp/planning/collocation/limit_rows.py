@@ -154,7 +154,7 @@ class LimitRows:
         boxes = self.rows_per_point - self.lower_index.size - self.upper_index.size
         if (g[-2:] < -tolerance).any() or at_points[:, :boxes].any():
             return None
-        sides = np.flatnonzero(at_points.any(axis=0)[boxes:])
+        sides = np.flatnonzero(at_points[:, boxes:].any(axis=0))
         rows = np.concatenate([self.lower_index, self.upper_index])[sides]
         return np.unique(rows), int(at_points.any(axis=1).argmax())
 

@@ -85,13 +85,15 @@ def assemble(
     m = jacobian.shape[1]
     R = (omega.size - 2) // K
     T2 = T * T
+    per_T2 = 1.0 / T2
     effort = factor * rho / (K - 1) / (T2 * T)
     band[:] = 0.0
     column[:] = 0.0
     corner = 0.0 if fixed else (omega[omega.size - 2] + omega[omega.size - 1]) / longest**2
 
-    G = np.empty((2 * n, 2 * n))  # by (q, v)
-    qq, qa, aq, aa = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    width = (n + 7) // 8 * 8
+    qq, qa, aq, aa = np.zeros((n, width)), np.zeros((n, width)), np.zeros((n, width)), np.zeros((n, width))
+    by_q, by_a = np.zeros(width), np.zeros(width)
     run = np.empty((n, TAPS * n))
     ww = np.empty(n)
     qT, wT, aT = np.empty(n), np.empty(n), np.empty(n)
@@ -111,33 +113,48 @@ def assemble(
             row_stiffness[up[i]] += omega[boxes + lo.size + i]
         for j in range(n):
             by_v[j] = 0.0
-        for i in range(2 * n):
-            for j in range(2 * n):
-                G[i, j] = -curvature * hessian[k, i, j]
+        # Blocks by (q, v): qq, aq and aa; qa is the transpose of aq.
+        for i in range(n):
+            for j in range(n):
+                qq[i, j] = -curvature * hessian[k, i, j]
+                aq[i, j] = -curvature * hessian[k, n + i, j]
+                aa[i, j] = -curvature * hessian[k, n + i, n + j]
         for r in range(m):
-            if end and free[r] == 0.0:
+            if free[r] == 0.0 and end:
                 continue
             stiff = row_stiffness[r] * scale[r] * scale[r]
-            for i in range(2 * n):
-                here = stiff * jacobian[k, r, i]
-                for j in range(2 * n):
-                    G[i, j] += here * jacobian[k, r, j]
             for j in range(n):
-                by_v[j] += curvature * weights[k, r] * jacobian[k, r, n + j]
-
+                by_q[j] = jacobian[k, r, j]
+            for i in range(n):
+                here = stiff * by_q[i]
+                for j in range(width):
+                    qq[i, j] += here * by_q[j]
+            if free[r] == 0.0:
+                continue
+            for j in range(n):
+                by_a[j] = jacobian[k, r, n + j]
+            for i in range(n):
+                here = stiff * by_a[i]
+                for j in range(width):
+                    aq[i, j] += here * by_q[j]
+                    aa[i, j] += here * by_a[j]
+            for j in range(n):
+                by_v[j] += curvature * weights[k, r] * by_a[j]
+        # Chain rule to (q, a, T): v = a / T², ∂v/∂T = −2 v / T.
         for i in range(n):
             qT[i], aT[i] = 0.0, 0.0
-            for j in range(n):
-                qq[i, j] = G[i, j]
-                qa[i, j] = G[i, n + j] / T2
-                aq[i, j] = G[n + i, j] / T2
-                aa[i, j] = G[n + i, n + j] / (T2 * T2)
         for i in range(n):
-            # ∂v/∂T = −2 v / T; second derivatives of v times the rows' multipliers enter with the sign of −λ g.
+            dv = -2.0 / T * v[k, i]
             for j in range(n):
-                dv = -2.0 / T * v[k, j]
-                qT[i] += G[i, n + j] * dv
-                aT[i] += G[n + i, n + j] * dv
+                qT[j] += aq[i, j] * dv
+                aT[j] += aa[i, j] * dv
+        for i in range(n):
+            for j in range(n):
+                aq[i, j] *= per_T2
+                aa[i, j] *= per_T2 * per_T2
+                qa[j, i] = aq[i, j]
+        for i in range(n):
+            # Second derivatives of v times the rows' multipliers enter with the sign of −λ g.
             corner += aT[i] * (-2.0 / T * v[k, i]) - 6.0 / T2 * by_v[i] * v[k, i]
             a = z[CURVATURE, k, i]
             aT[i] = aT[i] / T2 + 2.0 / (T2 * T) * by_v[i] - 6.0 * effort / T * a

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from dyngrasp.planning.collocation import banded, limit_rows, newton_matrix, three_tap
 from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import NodeFunctions
-from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, ThreeTap
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, Indices, ThreeTap
 from dyngrasp.planning.collocation.window import Window
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
@@ -75,8 +76,7 @@ class PhaseModel:
 
     def _place(self, x: Array, T: float) -> None:
         work, tap = self.work, self.map
-        three_tap.expand(tap.first, tap.taps, tap.offset, tap.slope, x, T, work.z)
-        np.divide(work.z[CURVATURE], T * T, out=work.v)
+        three_tap.place(tap.first, tap.taps, tap.offset, tap.slope, x, T, work.z, work.v)
         self._T = T
 
     def values(self, x: Array, T: float, g: Array) -> float:
@@ -86,8 +86,7 @@ class PhaseModel:
         for parameters, function in zip(self.parameters, self.functions, strict=True):
             function.values(work.z[POSITION], work.v, parameters, work.c, column)
             column += function.rows
-        limit_rows.row_values(work.z, T, work.c, self._arguments, g)
-        return newton_matrix.objective(work.z[CURVATURE], T, self.effort_weight)
+        return _rows_and_objective(work.z, T, work.c, self._arguments, self.effort_weight, g)
 
     def violation_at_the_ends(self) -> tuple[float, str]:
         """Worst violation of rows that the boundary positions alone decide, at the current point, and their name."""
@@ -121,65 +120,189 @@ class PhaseModel:
                 column,
             )
             column += function.rows
-        limit_rows.row_values(work.z, T, work.c, self._arguments, g)
-        return newton_matrix.objective(work.z[CURVATURE], T, self.effort_weight)
+        return _rows_and_objective(work.z, T, work.c, self._arguments, self.effort_weight, g)
 
     def descent(self, y: Array, out: Array) -> float:
         """Write −∇f + Jᵀ y by x into `out` (N−1, n), return it by T."""
         work, tap = self.work, self.map
-        work.dual[:] = 0.0
-        limit_rows.constraint_weights(y, self._arguments, work.y_weights)
-        by_T = limit_rows.rows_transposed(y, self._T, work.v, work.jacobian, self._arguments, work.y_weights, work.dual)
-        rho = self.effort_weight
-        by_T += newton_matrix.add_objective_gradient(work.z[CURVATURE], self._T, rho, -self.factor, work.dual)
-        return by_T + three_tap.pull_back(tap.first, tap.taps, tap.slope, work.dual, out)
-
-    def row_steps(self, dx: Array, dT: float, dg: Array) -> None:
-        """Write J d."""
-        work, tap = self.work, self.map
-        three_tap.expand_step(tap.first, tap.taps, tap.slope, dx, dT, work.dz)
-        limit_rows.row_steps(work.dz, dT, self._T, work.v, work.jacobian, self._arguments, dg)
-
-    def factorise(self, omega: Array, multiplier: Array, curvature: float, shift: float) -> bool:
-        """Assemble and factorise H + Jᵀ Ω J + shift · ∂²|a|²/2; whether the banded part is positive definite."""
-        work, tap = self.work, self.map
-        self.corner = newton_matrix.assemble(
-            work.z,
+        return _descent(
+            y,
             self._T,
+            work.z,
             work.v,
-            omega,
-            multiplier,
-            work.weights,
             work.jacobian,
-            work.hessian,
             self._arguments,
             self.effort_weight,
             self.factor,
-            curvature,
-            shift,
+            tap.first,
+            tap.taps,
+            tap.slope,
+            work.y_weights,
+            work.dual,
+            out,
+        )
+
+    def newton_step(self, y: Array, rhs: Array, dx: Array, dg: Array, longest: float) -> tuple[float, float, float]:
+        """The step of the factorised system for multipliers y, and how the rows change with it.
+
+        Args:
+            y: (K · R + 2,) multipliers after the step if the rows stayed as they are.
+            rhs: (N−1, n), overwritten by −∇f + Jᵀ y by x.
+            dx: (N−1, n), overwritten by the step.
+            dg: (K · R + 2,), overwritten by J d.
+            longest: A step of T beyond it is cut to that and dx solved for it: as if the corner had been larger.
+
+        Returns:
+            dT, the right-hand side by T, and the product of right-hand side and step.
+        """
+        work, tap = self.work, self.map
+        return _newton_step(
+            y,
+            self._T,
+            work.z,
+            work.v,
+            work.jacobian,
+            self._arguments,
+            self.effort_weight,
+            self.factor,
             tap.first,
             tap.taps,
             tap.slope,
             work.band,
-            work.column,
+            work.solved_column,
+            self.complement,
+            longest,
+            work.y_weights,
+            work.dual,
+            work.dz,
+            rhs,
+            dx,
+            dg,
         )
-        if not banded.cholesky(work.band):
-            return False
-        self.complement = banded.schur_complement(work.band, work.column, self.corner, work.solved_column)
-        return bool(np.isfinite(self.complement))
 
-    def solve(self, x: Array, by_T: float, longest: float) -> float:
-        """Overwrite a right-hand side x (N−1, n) by the solution; return its last unknown, the step of T.
+    def factorise(self, omega: Array, multiplier: Array, curvature: float, shift: float) -> bool:
+        """Assemble and factorise H + Jᵀ Ω J + shift · ∂²|a|²/2; whether the banded part is positive definite."""
+        work, tap = self.work, self.map
+        definite, self.corner, self.complement = _factorise(
+            (
+                work.z,
+                self._T,
+                work.v,
+                omega,
+                multiplier,
+                work.weights,
+                work.jacobian,
+                work.hessian,
+                self._arguments,
+                self.effort_weight,
+                self.factor,
+                curvature,
+                shift,
+                tap.first,
+                tap.taps,
+                tap.slope,
+                work.band,
+                work.column,
+            ),
+            work.solved_column,
+        )
+        return definite
 
-        A step of T beyond `longest` is cut to that and x solved for it: as if the corner had been larger.
-        """
+    def solve(self, x: Array, by_T: float) -> float:
+        """Overwrite a right-hand side x (N−1, n) by the solution; return its last unknown."""
         work = self.work
-        if self.limits.fixed_duration:
-            banded.solve_in_place(work.band, x.ravel())
-            return 0.0
-        step = banded.solve_bordered(work.band, work.solved_column, self.complement, x.ravel(), by_T)
-        if abs(step) <= longest:
-            return step
-        cut = np.copysign(longest, step)
-        x.ravel()[:] += (step - cut) * work.solved_column
-        return cut
+        return _solve(work.band, work.solved_column, self.complement, x, by_T, np.inf, self.limits.fixed_duration)
+
+
+@njit(cache=True, error_model="numpy")
+def _rows_and_objective(z: Array, T: float, c: Array, limits: tuple, rho: float, g: Array) -> float:
+    limit_rows.row_values(z, T, c, limits, g)
+    return newton_matrix.objective(z[CURVATURE], T, rho)
+
+
+@njit(cache=True, error_model="numpy")
+def _factorise(system: tuple, solved_column: Array) -> tuple[bool, float, float]:
+    """Whether the banded part is positive definite, the corner, and its Schur complement."""
+    corner = newton_matrix.assemble(*system)
+    band, column = system[-2], system[-1]
+    if not banded.cholesky(band):
+        return False, corner, np.nan
+    complement = banded.schur_complement(band, column, corner, solved_column)
+    return bool(np.isfinite(complement)), corner, complement
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(
+    band: Array, solved_column: Array, complement: float, x: Array, by_T: float, longest: float, fixed: bool
+) -> float:
+    unknowns = x.reshape(x.size)
+    if fixed:
+        banded.solve_in_place(band, unknowns)
+        return 0.0
+    step = banded.solve_bordered(band, solved_column, complement, unknowns, by_T)
+    if abs(step) <= longest:
+        return step
+    cut = np.copysign(longest, step)
+    unknowns += (step - cut) * solved_column
+    return cut
+
+
+@njit(cache=True, error_model="numpy")
+def _newton_step(
+    y: Array,
+    T: float,
+    z: Array,
+    v: Array,
+    jacobian: Array,
+    limits: tuple,
+    rho: float,
+    factor: float,
+    first: Indices,
+    taps: Array,
+    slope: Array,
+    band: Array,
+    solved_column: Array,
+    complement: float,
+    longest: float,
+    y_weights: Array,
+    dual: Array,
+    dz: Array,
+    rhs: Array,
+    dx: Array,
+    dg: Array,
+) -> tuple[float, float, float]:
+    by_T = _descent(y, T, z, v, jacobian, limits, rho, factor, first, taps, slope, y_weights, dual, rhs)
+    dx[:] = rhs
+    fixed = limits[-1]
+    dT = _solve(band, solved_column, complement, dx, by_T, longest, fixed)
+    three_tap.expand_step(first, taps, slope, dx, dT, dz)
+    limit_rows.row_steps(dz, dT, T, v, jacobian, limits, dg)
+    product = by_T * dT
+    for k in range(dx.shape[0]):
+        for j in range(dx.shape[1]):
+            product += rhs[k, j] * dx[k, j]
+    return dT, by_T, product
+
+
+@njit(cache=True, error_model="numpy")
+def _descent(
+    y: Array,
+    T: float,
+    z: Array,
+    v: Array,
+    jacobian: Array,
+    limits: tuple,
+    rho: float,
+    factor: float,
+    first: Indices,
+    taps: Array,
+    slope: Array,
+    y_weights: Array,
+    dual: Array,
+    out: Array,
+) -> float:
+    dual[:] = 0.0
+    limit_rows.constraint_weights(y, limits, y_weights)
+    by_T = limit_rows.rows_transposed(y, T, v, jacobian, limits, y_weights, dual)
+    by_T += newton_matrix.add_objective_gradient(z[CURVATURE], T, rho, -factor, dual)
+    return by_T + three_tap.pull_back(first, taps, slope, dual, out)

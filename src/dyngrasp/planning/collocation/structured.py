@@ -43,7 +43,7 @@ class StructuredSettings:
         window_barrier: The same where only the end of the motion is sought, under few rows.
     """
 
-    tolerance: float = 1e-8
+    tolerance: float = 1e-7
     violation_tolerance: float = 1e-9
     max_iterations: int = 500
     time_limit: float = 5.0

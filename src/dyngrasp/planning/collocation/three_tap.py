@@ -116,6 +116,18 @@ def expand(first: Indices, taps: Array, offset: Array, slope: Array, x: Array, d
 
 
 @njit(cache=True)
+def place(
+    first: Indices, taps: Array, offset: Array, slope: Array, x: Array, duration: float, z: Array, v: Array
+) -> None:
+    """`expand`, and the accelerations v = a / T²."""
+    expand(first, taps, offset, slope, x, duration, z)
+    scale = 1.0 / duration**2
+    for k in range(v.shape[0]):
+        for j in range(v.shape[1]):
+            v[k, j] = scale * z[CURVATURE, k, j]
+
+
+@njit(cache=True)
 def expand_step(first: Indices, taps: Array, slope: Array, dx: Array, dT: float, dz: Array) -> None:
     """The linear part of `expand`: how q, w and a change with dx and dT."""
     kinds, points, n = dz.shape

@@ -84,5 +84,5 @@ def _before(intervals: int, first: int) -> tuple[Array, Array, Array]:
     i = np.arange(first)
     rows = [np.where(i > 0, np.maximum(m - i, 0.0), m / 2 - 0.25) for m in (first - 1, first)]
     matrix = np.array(rows) / intervals**2
-    C = np.linalg.inv(matrix @ matrix.T)
-    return matrix, np.linalg.cholesky(C), C
+    C = np.asarray(np.linalg.inv(matrix @ matrix.T), dtype=float)
+    return matrix, np.asarray(np.linalg.cholesky(C), dtype=float), C
