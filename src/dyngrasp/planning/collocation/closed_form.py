@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+from numba import njit
 
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array, read_only
@@ -53,14 +54,21 @@ def integrate(start_position: Array, start_rate: Array, curvature: Array) -> tup
     Returns:
         q and w, each (N+1, n).
     """
-    half = 0.5 / (curvature.shape[0] - 1)
-    rate = np.empty_like(curvature)
-    rate[0] = start_rate
-    rate[1:] = start_rate + half * np.cumsum(curvature[1:] + curvature[:-1], axis=0)
-    position = np.empty_like(curvature)
-    position[0] = start_position
-    position[1:] = start_position + half * np.cumsum(rate[1:] + rate[:-1], axis=0)
+    position, rate = np.empty_like(curvature), np.empty_like(curvature)
+    _integrate(start_position, start_rate, curvature, position, rate)
     return position, rate
+
+
+@njit(cache=True)
+def _integrate(start_position: Array, start_rate: Array, curvature: Array, position: Array, rate: Array) -> None:
+    points, joints = curvature.shape
+    half = 0.5 / (points - 1)
+    for j in range(joints):
+        position[0, j], rate[0, j] = start_position[j], start_rate[j]
+    for k in range(1, points):
+        for j in range(joints):
+            rate[k, j] = rate[k - 1, j] + half * (curvature[k, j] + curvature[k - 1, j])
+            position[k, j] = position[k - 1, j] + half * (rate[k, j] + rate[k - 1, j])
 
 
 def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float) -> Trajectory:
@@ -106,7 +114,8 @@ def _coefficients(gram_inverse: Array, fixed: Array, linear: Array) -> Array:
 def least_cost(problem: PhaseProblem, duration: float) -> float:
     """J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), the objective of `least_effort` (s)."""
     weight = problem.effort_weight / problem.intervals
-    return float(_cost(effort_coefficients(problem), weight, np.array([duration]))[0])
+    c0, c1, c2 = effort_coefficients(problem)
+    return float(_cost(c0, c1, c2, weight, duration))
 
 
 def best_duration(problem: PhaseProblem) -> float:
@@ -114,29 +123,78 @@ def best_duration(problem: PhaseProblem) -> float:
 
     An end of the interval or a root of the quartic T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
     """
-    return float(_best_root(effort_coefficients(problem), problem)[0])
+    return float(_best_root(effort_coefficients(problem)[None], problem)[0][0])
 
 
-def _cost(coefficients: Array, weight: float, duration: Array) -> Array:
-    """(..., D) J at durations (..., D) for coefficients (..., 3)."""
-    c0, c1, c2 = np.moveaxis(coefficients[..., None, :], -1, 0)
-    return duration + weight * (c0 / duration**3 + c1 / duration**2 + c2 / duration)
+@njit(cache=True)
+def _cost(c0: float, c1: float, c2: float, weight: float, duration: float) -> float:
+    """J at a duration."""
+    return duration + weight * ((c0 / duration + c1) / duration + c2) / duration
 
 
 def _best_root(coefficients: Array, problem: PhaseProblem) -> tuple[Array, Array]:
-    """Duration within its bounds that minimises J(T), and J there, for each row of coefficients (..., 3)."""
-    weight = problem.effort_weight / problem.intervals
-    companion = np.zeros((*coefficients.shape[:-1], 4, 4))
-    companion[..., 1:, :-1] = np.eye(3)
-    companion[..., 0, 1:] = weight * coefficients[..., ::-1] * (1.0, 2.0, 3.0)
-    roots = np.asarray(np.linalg.eigvals(companion).real, dtype=float)
+    """Duration within its bounds that minimises J(T), and J there, for each row of coefficients (S, 3)."""
     shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
-    ends = np.broadcast_to([shortest, problem.max_duration], (*roots.shape[:-1], 2))
-    # Complex pairs come with their real parts too: J decides, so a candidate too many does no harm.
-    candidates = np.clip(np.concatenate([roots, ends], axis=-1), shortest, problem.max_duration)
-    costs = _cost(coefficients, weight, candidates)
-    best = costs.argmin(axis=-1, keepdims=True)
-    return np.take_along_axis(candidates, best, -1)[..., 0], np.take_along_axis(costs, best, -1)[..., 0]
+    weight = problem.effort_weight / problem.intervals
+    durations, costs = np.empty(len(coefficients)), np.empty(len(coefficients))
+    _minimise(coefficients, weight, shortest, problem.max_duration, durations, costs)
+    return durations, costs
+
+
+@njit(cache=True)
+def _minimise(
+    coefficients: Array, weight: float, shortest: float, longest: float, durations: Array, costs: Array
+) -> None:
+    """Of the ends of the interval and the roots of the quartic between them the one where J is least.
+
+    The quartic p(T) = T⁴ − ρ/N (c2 T² + 2 c1 T + 3 c0) is monotone between neighbouring roots of its derivative, a
+    cubic without quadratic term: each such stretch has one root of p at most, found by bisection to the last digit.
+    """
+    corners = np.empty(5)
+    for i in range(len(coefficients)):
+        c0, c1, c2 = coefficients[i]
+        best, least = shortest, _cost(c0, c1, c2, weight, shortest)
+        at_end = _cost(c0, c1, c2, weight, longest)
+        if at_end < least:
+            best, least = longest, at_end
+        corners[:] = shortest
+        corners[4] = longest
+        # T³ − m T − k = 0 by Cardano, or by Vieta where there are three roots.
+        m, k = weight * c2 / 2, weight * c1 / 2
+        discriminant = k * k / 4 - m * m * m / 27
+        if discriminant > 0:
+            root = np.sqrt(discriminant)
+            corners[1] = np.cbrt(k / 2 + root) + np.cbrt(k / 2 - root)
+        elif m > 0:
+            radius = np.sqrt(m / 3)
+            angle = np.arccos(min(max(k / 2 / radius**3, -1.0), 1.0)) / 3
+            for j in range(3):
+                corners[1 + j] = 2 * radius * np.cos(angle - 2 * np.pi * j / 3)
+        for j in range(1, 4):
+            corners[j] = min(max(corners[j], shortest), longest)
+        corners.sort()
+        for j in range(4):
+            lower, upper = corners[j], corners[j + 1]
+            rising = _slope(c0, c1, c2, weight, upper) > 0
+            if rising == (_slope(c0, c1, c2, weight, lower) > 0):
+                continue
+            middle = (lower + upper) / 2
+            while lower < middle < upper:
+                if (_slope(c0, c1, c2, weight, middle) > 0) == rising:
+                    upper = middle
+                else:
+                    lower = middle
+                middle = (lower + upper) / 2
+            cost = _cost(c0, c1, c2, weight, middle)
+            if cost < least:
+                best, least = middle, cost
+        durations[i], costs[i] = best, least
+
+
+@njit(cache=True)
+def _slope(c0: float, c1: float, c2: float, weight: float, T: float) -> float:
+    """The quartic: T⁴ dJ/dT."""
+    return T**4 - weight * ((c2 * T + 2 * c1) * T + 3 * c0)
 
 
 def unconstrained_optimum(problem: PhaseProblem) -> Trajectory:

@@ -59,11 +59,8 @@ class ThreeTap:
         h = 1.0 / problem.intervals
         ends = np.stack([problem.start_position, problem.end_position])
         rates = np.stack([problem.start_velocity, problem.end_velocity])
-        # reach[k, z, end, before/after]: how r[−1], r[1] and r[N−1], r[N+1] enter z[k].
-        offset = np.einsum("kzes,ej->zkj", reach, 2 * ends)
-        slope = h * np.einsum("kze,ej->zkj", reach[..., 1] - reach[..., 0], rates)
-        # einsum may hand out transposed memory; compiled code reads these arrays row by row.
-        return cls(first, taps, np.ascontiguousarray(offset), np.ascontiguousarray(slope))
+        # r[−1], r[1] = 2 q_S − r[0] ∓ h T q̇_S, and the same at the far end.
+        return cls(first, taps, 2 * (reach[..., 0] + reach[..., 1]) @ ends, h * (reach[..., 1] - reach[..., 0]) @ rates)
 
     def unknowns(self, trajectory: Trajectory) -> Array:
         """(N−1, n) x of a motion on this grid: r[k] = q[k] − h² a[k] / 4."""
@@ -80,11 +77,11 @@ class ThreeTap:
 
 @lru_cache(maxsize=64)
 def _filters(intervals: int) -> tuple[Indices, Array, Array]:
-    """`first`, `taps` and the coefficients (N+1, 3, 2, 2) of the four eliminated values [k, z, end, before/after]."""
+    """`first`, `taps` and the coefficients (3, N+1, 2, 2) of the four eliminated values [z, k, end, before/after]."""
     N, h = intervals, 1.0 / intervals
     weights = np.array([[0.25, -0.5 / h, 1 / h**2], [0.5, 0.0, -2 / h**2], [0.25, 0.5 / h, 1 / h**2]])
     first = np.clip(np.arange(N + 1) - 2, 0, N - 4)
-    taps, reach = np.zeros((N + 1, TAPS, 3)), np.zeros((N + 1, 3, 2, 2))
+    taps, reach = np.zeros((N + 1, TAPS, 3)), np.zeros((3, N + 1, 2, 2))
     eliminated = {-1: (0, 0), 1: (0, 1), N - 1: (1, 0), N + 1: (1, 1)}
     column = {0: 0, N: N - 2} | {i: i - 1 for i in range(2, N - 1)}
     for k in range(N + 1):
@@ -92,7 +89,7 @@ def _filters(intervals: int) -> tuple[Indices, Array, Array]:
             i = k + step
             if i in eliminated:
                 end, side = eliminated[i]
-                reach[k, :, end, side] += weight
+                reach[:, k, end, side] += weight
                 # r[±1] = … − r[0], and the same at the far end: an eliminated value also counts for its neighbour.
                 taps[k, column[N * end] - first[k]] -= weight
             else:
