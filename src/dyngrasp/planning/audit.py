@@ -25,7 +25,7 @@ from dyngrasp.planning.clearance import clearance_entries, waypoints_of
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import AuditEntry, AuditReport
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, Trajectory
+from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, Trajectory, largest_difference
 
 # Samples of an interval between two grid points in which a constraint could be broken: a velocity, quadratic in
 # between, is then seen to 1/256 of its height.
@@ -190,16 +190,37 @@ def standstill(plan: GraspPlan, task: GraspTask, since: float = -np.inf) -> Audi
     first, last = max(since, plan.start_time + span), plan.end_time - span
     slowest, time = np.inf, last
     for arm, T in zip(plan.arm, plan.phase_ends.tolist(), strict=True):
-        w, v, step = arm.velocity, arm.acceleration, arm.duration / arm.intervals
-        halfway = (w[1:] + w[:-1]) / 2 - step / 8 * (v[1:] - v[:-1])
-        for velocity, times in ((w, arm.times), (halfway, arm.times[:-1] + step / 2)):
-            clock = T - arm.duration + times
-            inside = (clock >= first) & (clock <= last)
-            speed = np.where(inside, (np.abs(velocity) / task.robot.limits.velocity).max(axis=1), np.inf)
-            k = int(speed.argmin())
-            if speed[k] < slowest:
-                slowest, time = float(speed[k]), float(clock[k])
+        begin, limit = T - arm.duration, task.robot.limits.velocity
+        speed, at = _slowest(arm.duration, arm.velocity, arm.acceleration, limit, first - begin, last - begin)
+        # A NaN, once found, stays.
+        if not speed >= slowest and slowest == slowest:
+            slowest, time = speed, begin + at
     return AuditEntry("standstill", slowest, LEAST_SPEED, True, 0.0, "of limit", time)
+
+
+@njit(cache=True)
+def _slowest(duration, velocity, acceleration, limit, first, last):
+    """Least max-norm of velocities (N+1, n) over their limits from `first` to `last` (s), and its time.
+
+    Looked at are the grid points and, half way between them, the quadratic that the velocity is there.
+    """
+    N, n = velocity.shape[0] - 1, velocity.shape[1]
+    step, least, time = duration / N, np.inf, last
+    for half in range(2 * N + 1):
+        t, k = half * step / 2, half // 2
+        if t < first or t > last:
+            continue
+        speed = 0.0
+        for i in range(n):
+            w = velocity[k, i]
+            if half % 2:
+                w = (w + velocity[k + 1, i]) / 2 - step / 8 * (acceleration[k + 1, i] - acceleration[k, i])
+            share = abs(w) / limit[i]
+            if not share <= speed and speed == speed:
+                speed = share
+        if not speed >= least and least == least:
+            least, time = speed, t
+    return least, time
 
 
 def _rows(
@@ -319,7 +340,7 @@ def _joins(plan: GraspPlan) -> list[AuditEntry]:
     entries = []
     for name, unit in (("position", "rad"), ("velocity", "rad/s")):
         jumps = [
-            max(float(np.abs(getattr(a, name)[-1] - getattr(b, name)[0]).max()) for a, b in pairs)
+            max(largest_difference(getattr(a, name)[-1], getattr(b, name)[0]) for a, b in pairs)
             for pairs in zip(_neighbours(plan.arm), _neighbours(plan.gripper), strict=True)
         ]
         worst = int(np.argmax(jumps))
