@@ -11,9 +11,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from dyngrasp.simulation.conveyor import CONVEYOR, Conveyor, ConveyorAddresses, add_conveyor, locate_conveyor
+from dyngrasp.simulation.printed_sheet import PrintedSheet, add_sheet
 from dyngrasp.simulation.variation import PlantVariation
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from mujoco import MjModel, MjSpec
 
     from dyngrasp.models.grasp_object import GraspObject
@@ -97,6 +100,7 @@ def build_scene(
     *,
     markers: bool = False,
     conveyor: Conveyor | None = None,
+    sheets: Sequence[PrintedSheet] = (),
 ) -> Scene:
     """Compose and compile the world.
 
@@ -111,6 +115,7 @@ def build_scene(
         settings: Numerics.
         markers: Stick the part's markers on its faces, for cameras and pictures; they weigh and touch nothing.
         conveyor: What the part stands on, if not on the ground.
+        sheets: What else is printed and lies in the world, such as a calibration board.
 
     Raises:
         ValueError: The variation is for another number of joints.
@@ -132,6 +137,8 @@ def build_scene(
         from dyngrasp.simulation.marker_stickers import add_stickers
 
         add_stickers(spec, spec.body(PART), grasp_object)
+    for sheet in sheets:
+        add_sheet(spec, spec.worldbody, sheet)
     _add_motors(spec, robot, gripper, settings)
     if conveyor is not None:
         add_conveyor(spec, conveyor, settings)
