@@ -156,6 +156,7 @@ def _structured_row(case: str, problems: list[TrackingProblem]) -> dict[str, Any
         "case": case,
         **timing_summary([s.elapsed_ms for s in solutions]),
         "solved": sum(s.status is Status.CONVERGED for s in solutions),
+        "infeasible": sum(s.status is Status.INFEASIBLE for s in solutions),
         "active_rows": float(np.median(active)),
     }
 

@@ -1,11 +1,15 @@
-"""The interior point method of the tracking program, on the rows that matter."""
+"""The interior point method of the tracking program, on the rows that matter.
+
+Which rows matter shows on the way: it begins with those near the optimum without rows, and as it closes in takes up
+others that its point comes near to, with slacks of their own.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.box_rows import bound
+from dyngrasp.planning.replanning.box_rows import bound, collect
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
     Indices,
@@ -20,10 +24,16 @@ from dyngrasp.signals import Array
 
 OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NONFINITE = 0, 1, 2, 3
 
+# Rows are looked for when the complementarity, over the cost, first falls below this and each time it has fallen by as
+# much again; those closer to their bound than this are taken up, with slacks no smaller than that.
+LOOK_BELOW, LOOK_NEAR = 0.3, 1e-2
+
 
 @njit(cache=True, error_model="numpy")
 def interior_point(
     codes: Indices,
+    rows: int,
+    a_ends: tuple[bool, bool],
     first: Indices,
     taps: Array,
     base: Array,
@@ -46,11 +56,13 @@ def interior_point(
     unit: float,
     max_iterations: int,
     multipliers: Array,
-) -> tuple[int, float, int]:
+) -> tuple[int, float, int, int]:
     """Mehrotra's predictor–corrector from a point that minimises the cost without rows.
 
     Args:
-        codes: Rows to impose; those of T are always imposed where T is free.
+        codes: Rows to impose; appended to. Those of T are always imposed where T is free.
+        rows: How many codes there are at first.
+        a_ends: See `collect`.
         first: Of `filters`.
         taps: Of `filters`.
         base: (N−1, 3, n) band of the Hessian of the cost.
@@ -59,12 +71,12 @@ def interior_point(
         slope: (3, K, n) how q, w, a change with T at constant x.
         by_T: (3, K, n) how the errors change with T.
         stiffness_T: Second derivative of the cost's own term in T.
-        error: (3, K, n) errors at the start, changed along.
+        error: (3, K, n) errors at the start.
         gradient_T: First derivative of the cost's own term in T at the start.
         dx: (N−1, n), added to: the steps taken.
         T: At the start (s).
         T_lin: Where the rows are linear (s).
-        z: (3, K, n) q, w, a at the start, changed along.
+        z: (3, K, n) q, w, a at the start, overwritten by those in the end.
         boxes: See `bound`.
         rates: See `bound`.
         duration: Bounds of T (s).
@@ -72,82 +84,87 @@ def interior_point(
         ends_cost: Whether the cost counts both end points.
         unit: Typical size of the cost.
         max_iterations: Of the method.
-        multipliers: (len(codes) + 2,) written: λ of each row, those of T last.
+        multipliers: Written: λ of each row, those of T last.
 
     Returns:
-        Outcome, T, iterations.
+        Outcome, T, iterations, number of rows in the end.
     """
     _, K, n = z.shape
     size = K - 2
-    rows = codes.size
-    m = rows + 2
-    kinds, nodes, joints = np.empty(rows, np.int64), np.empty(rows, np.int64), np.empty(rows, np.int64)
-    signs, cs, scales, g = np.empty(rows), np.empty(m), np.empty(rows), np.empty(m)
+    all_rows = 6 * K * n
+    m = all_rows + 2
+    kinds, nodes, joints = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.int64)
+    signs, cs, scales, g = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    imposed, found = np.zeros(all_rows, np.bool_), np.empty(all_rows, np.int64)
     for i in range(rows):
-        j = codes[i] % n
-        k = (codes[i] // n) % K
-        kind = codes[i] // (n * K * 2)
-        sign = 1.0 - 2.0 * ((codes[i] // (n * K)) % 2)
-        b, c, scale = bound(kind, k, j, sign, T_lin, boxes, rates)
-        kinds[i], nodes[i], joints[i], signs[i], scales[i] = kind, k, j, sign, scale
-        cs[i] = (c - sign * slope[kind, k, j]) * scale
-        g[i] = (b + c * (T - T_lin) - sign * z[kind, k, j]) * scale
+        imposed[codes[i]] = True
+    _impose(codes, 0, rows, n, K, T, T_lin, z, slope, boxes, rates, kinds, nodes, joints, signs, scales, cs, g)
     shortest, longest = duration
     limited_T = free_T and longest < np.inf
     cs[rows], cs[rows + 1] = 1.0 / longest, -1.0 / longest
     g[rows], g[rows + 1] = (T - shortest) / longest, (longest - T) / longest
 
-    used = m if limited_T else rows
+    used = rows + 2 if limited_T else rows
     least = 0.0
     for i in range(used):
         least = min(least, g[i])
     floor = max(-least, 1e-2)
-    s, lam, ds, dlam, dg, omega, target = (
-        np.empty(m),
-        np.empty(m),
-        np.zeros(m),
-        np.zeros(m),
-        np.zeros(m),
-        np.empty(m),
-        np.empty(m),
-    )
+    s, lam, omega, target = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    ds, dlam, dg = np.zeros(m), np.zeros(m), np.zeros(m)
     mu = 0.1 * unit / max(used, 1)
     for i in range(used):
         s[i] = max(g[i], floor)
         lam[i] = mu / s[i]
     band, column, solved = np.empty_like(base), np.empty((size, n)), np.empty((size, n))
     gradient, step, dual = np.empty((size, n)), np.empty((size, n)), np.empty_like(z)
-    dz = np.empty_like(z)
+    # Steps that z has not followed yet: it is asked for only when rows are looked for.
+    ahead, ahead_T = np.zeros((size, n)), 0.0
     k_first, k_last = (0, K) if ends_cost else (1, K - 1)
     dual[:] = 0.0
     weigh(by_T, weights, node_weights, k_first, k_last, dual)
     corner = stiffness_T + product(dual, by_T)
     pull_back(first, taps, dual, column)
     base_column = column.copy()
+    # The cost is quadratic: its gradient follows from the steps.
+    weigh(error, weights, node_weights, k_first, k_last, dual)
+    g_T = gradient_T + product(dual, by_T)
+    pull_back(first, taps, dual, gradient)
     outcome = ITERATION_LIMIT
     iterations = 0
+    look_below = LOOK_BELOW
     for iteration in range(max_iterations + 1):
         iterations = iteration
-        # Gradient of the cost.
-        weigh(error, weights, node_weights, k_first, k_last, dual)
-        g_T = gradient_T + product(dual, by_T)
-        pull_back(first, taps, dual, gradient)
-        # Residuals.
         mean, primal = 0.0, 0.0
         for i in range(used):
             mean += s[i] * lam[i]
             primal = max(primal, abs(g[i] - s[i]))
         mean /= used
-        stationarity = 0.0
-        target[:used] = -lam[:used]
-        r_T = -g_T
-        step[:] = -gradient
-        r_T += _scatter(target, -1.0, rows, used, kinds, nodes, joints, signs, scales, cs, first, taps, step)
-        for i in range(size):
-            for j in range(n):
-                stationarity = max(stationarity, abs(step[i, j]))
-        if not np.isfinite(mean + primal + stationarity):
-            return NONFINITE, T, iteration
+        if mean * used <= look_below * unit:
+            look_below = LOOK_BELOW * mean * used / unit
+            _follow(first, taps, slope, ahead, ahead_T, dx, z)
+            ahead_T = 0.0
+            count, _ = collect(z, T, T_lin, boxes, rates, LOOK_NEAR, a_ends, found)
+            new = rows
+            for i in range(count):
+                if not imposed[found[i]]:
+                    imposed[found[i]] = True
+                    codes[new] = found[i]
+                    new += 1
+            if new > rows:
+                # The rows of T stay the last.
+                for array in (s, lam, g, cs, ds, dlam, dg):
+                    array[new], array[new + 1] = array[rows], array[rows + 1]
+                _impose(
+                    codes, rows, new, n, K, T, T_lin, z, slope, boxes, rates, kinds, nodes, joints, signs, scales, cs, g
+                )
+                for i in range(rows, new):
+                    s[i] = max(g[i], LOOK_NEAR)
+                    lam[i] = mean / s[i]
+                    primal = max(primal, abs(g[i] - s[i]))
+                used += new - rows
+                rows = new
+        if not np.isfinite(mean + primal + g_T):
+            return NONFINITE, T, iteration, rows
         if mean * used <= 1e-12 * unit and primal <= 1e-11:
             outcome = OPTIMAL
             break
@@ -191,7 +208,7 @@ def interior_point(
                 second = ds[i] * dlam[i] if corrected == 1 else 0.0
                 target[i] = (sigma_mu - second) / s[i] - omega[i] * (g[i] - s[i])
             step[:] = -gradient
-            r_T = -g_T + _scatter(target, 1.0, rows, used, kinds, nodes, joints, signs, scales, cs, first, taps, step)
+            r_T = -g_T + _scatter(target, rows, used, kinds, nodes, joints, signs, scales, cs, first, taps, step)
             dT = 0.0
             if free_T:
                 dT = r_T
@@ -238,26 +255,74 @@ def interior_point(
             lam[i] += length * dlam[i]
             g[i] += length * dg[i]
         T += length * dT
-        gradient_T += length * dT * stiffness_T
-        dz[:] = 0.0
-        push_forward(first, taps, step, dz)
+        ahead_T += length * dT
+        g_T += length * corner * dT
         for i in range(size):
             for j in range(n):
-                dx[i, j] += length * step[i, j]
-        for kind in range(3):
-            for k in range(K):
-                for j in range(n):
-                    error[kind, k, j] += length * (dz[kind, k, j] + by_T[kind, k, j] * dT)
-                    z[kind, k, j] += length * (dz[kind, k, j] + slope[kind, k, j] * dT)
+                along = length * step[i, j]
+                ahead[i, j] += along
+                g_T += base_column[i, j] * along
+                gradient[i, j] += base[i, 0, j] * along + length * dT * base_column[i, j]
+                if i + 1 < size:
+                    gradient[i, j] += base[i, 1, j] * length * step[i + 1, j]
+                    gradient[i + 1, j] += base[i, 1, j] * along
+                if i + 2 < size:
+                    gradient[i, j] += base[i, 2, j] * length * step[i + 2, j]
+                    gradient[i + 2, j] += base[i, 2, j] * along
+    _follow(first, taps, slope, ahead, ahead_T, dx, z)
     multipliers[:] = 0.0
     multipliers[:used] = lam[:used]
-    return outcome, T, iterations
+    return outcome, T, iterations, rows
+
+
+@njit(cache=True, error_model="numpy")
+def _follow(first: Indices, taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, z: Array) -> None:
+    """Add steps (N−1, n) of the unknowns, and one of T, to dx and z; the former are zero afterwards."""
+    push_forward(first, taps, ahead, z)
+    for kind in range(3):
+        for k in range(z.shape[1]):
+            for j in range(z.shape[2]):
+                z[kind, k, j] += slope[kind, k, j] * ahead_T
+    dx += ahead
+    ahead[:] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _impose(
+    codes: Indices,
+    begin: int,
+    end: int,
+    n: int,
+    K: int,
+    T: float,
+    T_lin: float,
+    z: Array,
+    slope: Array,
+    boxes: Array,
+    rates: Array,
+    kinds: Indices,
+    nodes: Indices,
+    joints: Indices,
+    signs: Array,
+    scales: Array,
+    cs: Array,
+    g: Array,
+) -> None:
+    """Decode some rows, and write their values g and their derivatives cs by T."""
+    for i in range(begin, end):
+        j = codes[i] % n
+        k = (codes[i] // n) % K
+        kind = codes[i] // (n * K * 2)
+        sign = 1.0 - 2.0 * ((codes[i] // (n * K)) % 2)
+        b, c, scale = bound(kind, k, j, sign, T_lin, boxes, rates)
+        kinds[i], nodes[i], joints[i], signs[i], scales[i] = kind, k, j, sign, scale
+        cs[i] = (c - sign * slope[kind, k, j]) * scale
+        g[i] = (b + c * (T - T_lin) - sign * z[kind, k, j]) * scale
 
 
 @njit(cache=True, error_model="numpy")
 def _scatter(
     y: Array,
-    factor: float,
     rows: int,
     used: int,
     kinds: Indices,
@@ -270,10 +335,10 @@ def _scatter(
     taps: Array,
     out: Array,
 ) -> float:
-    """Add factor · Gᵀ y to out (N−1, n); return the part of T."""
+    """Add Gᵀ y to out (N−1, n); return the part of T."""
     by_T = 0.0
     for i in range(used):
-        value = factor * y[i]
+        value = y[i]
         by_T += value * cs[i]
         if i < rows:
             kind, k, j = kinds[i], nodes[i], joints[i]

@@ -26,7 +26,7 @@ from dyngrasp.signals import Array
 VIOLATION = 1e-9
 
 # Rows this close to their bound without any of them imposed are the first guess of which may become active.
-NEAR = 0.15
+NEAR = 0.02
 
 
 @njit(cache=True, error_model="numpy")
@@ -210,12 +210,12 @@ def solve(
         unit = max(cost, 0.5 * (stiffness_T + np.sum(scaled[0])) * least * least, 1e-9)
         x_free, z_free, error_free = x.copy(), z.copy(), error.copy()
         T_free, gradient_free = T, gradient_T
-        margin = NEAR - least
-        count, _ = collect(z, T, T_lin, boxes, rates, margin, a_ends, codes)
         for attempt in range(3):
             x[:], z[:], error[:], T = x_free, z_free, error_free, T_free
-            outcome, T, steps = interior_point(
-                codes[:count],
+            outcome, T, steps, count = interior_point(
+                codes,
+                count,
+                a_ends,
                 first,
                 taps,
                 base,
@@ -247,7 +247,7 @@ def solve(
                 break
             if attempt == 0:
                 # What the free optimum and the one so far come near to; seldom is anything else active in the end.
-                near_free, _ = collect(z_free, T_free, T_lin, boxes, rates, margin, a_ends, codes)
+                near_free, _ = collect(z_free, T_free, T_lin, boxes, rates, NEAR, a_ends, codes)
                 near, _ = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes[near_free:])
                 count = distinct(codes[: near_free + near])
             else:
