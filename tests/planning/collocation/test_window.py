@@ -71,7 +71,7 @@ def test_an_approach_solved_by_its_end_is_an_optimum_of_the_whole(task, targets,
     solution = solver.solve(approach, planner.guess(approach, targets))
     assert solution.ok
     assert "end" in solution.message
-    # The method for the whole, from its motion and multipliers, finds nothing better nearby.
+    # The method for the whole, from its motion, finds nothing better nearby.
     monkeypatch.setattr(StructuredSolver, "_solve_window", lambda *_: None)
     again = solver.solve(approach, solution.require())
     assert again.ok

@@ -42,17 +42,6 @@ def start(g: Array, mu: float, price: float, least_slack: float, s: Array, t: Ar
 
 
 @njit(cache=True, error_model="numpy")
-def start_near(g: Array, mu: float, price: float, known: Array, s: Array, t: Array, multiplier: Array) -> None:
-    """Slacks and multipliers from multipliers `known` of a problem nearby, with products s λ of at least μ."""
-    for i in range(g.size):
-        value = min(max(known[i], 1e-3 * mu), price / 2)
-        t[i] = mu / price
-        s[i] = max(g[i] + t[i], mu / value)
-        t[i] = s[i] - g[i]
-        multiplier[i] = max(value, min(mu / s[i], price / 2))
-
-
-@njit(cache=True, error_model="numpy")
 def stiffness(s: Array, t: Array, multiplier: Array, price: float, omega: Array) -> None:
     """Ω: by how much the multiplier falls when the row grows."""
     for i in range(s.size):

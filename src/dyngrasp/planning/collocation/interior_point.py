@@ -78,7 +78,6 @@ class InteriorPoint:
         T: float,
         deadline: float = np.inf,
         barrier: float = 1e-3,
-        multipliers: Array | None = None,
         cautious: bool = False,
     ) -> tuple[Outcome, Best, int]:
         """Minimise from x (N−1, n) and T.
@@ -89,7 +88,6 @@ class InteriorPoint:
             T: Start, duration (s).
             deadline: A value of `time.perf_counter`; the best iterate until then is returned.
             barrier: μ at the start, relative to the objective.
-            multipliers: Of the rows at the solution of a problem nearby, for a warm start.
             cautious: Whether to begin in monotone mode, so that the start is not left far behind.
 
         Returns:
@@ -108,9 +106,6 @@ class InteriorPoint:
         self.best = Best(self.x.copy(), T)
         self.slow_limit, self.cautious = SLOW, cautious
         self._restart(1.0, 0)
-        if multipliers is not None:
-            self.mu = settings.warm_barrier * self.unit
-            rows.start_near(self.g, self.mu, self.price, multipliers, self.s, self.t, self.multiplier)
         for iteration in range(settings.max_iterations + 1):
             objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
             violation = -float(self.g.min())

@@ -18,7 +18,6 @@ class InteriorPointSettings:
         tolerance: E at the solution, relative to the objective.
         violation_tolerance: Largest violation of a row at the solution, in its scaled unit.
         max_iterations: Newton systems.
-        warm_barrier: μ at a start with known multipliers, relative to the objective.
         least_slack: Slack that a violated row begins with.
         price: ν at the start, relative to the objective.
         adaptive: Whether to use free mode at all.
@@ -27,7 +26,6 @@ class InteriorPointSettings:
     tolerance: float = 1e-8
     violation_tolerance: float = 1e-9
     max_iterations: int = 500
-    warm_barrier: float = 1e-5
     least_slack: float = 1e-2
     price: float = 1.0
     adaptive: bool = True

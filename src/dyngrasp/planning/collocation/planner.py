@@ -103,7 +103,7 @@ class _Reserves:
 _PHASE_OF_RESERVE = {"funnel": 0, "hold": 2}
 
 # Plans after which raising the reserves is given up.
-MOST_PLANS = 5
+MOST_PLANS = 8
 
 # The pre-grasp itself stands 20 mm above the tip of the funnel (m).
 LARGEST_FUNNEL_MARGIN = 0.015

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import logging
 import time
-import weakref
 from dataclasses import dataclass
 
 import casadi as ca
@@ -21,7 +20,7 @@ from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import InterpretedNodeFunctions, NodeFunctions, node_functions
 from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
 from dyngrasp.planning.collocation.three_tap import CURVATURE
-from dyngrasp.planning.collocation.window import EARLIEST, LATEST, STANDING_FOR, Window
+from dyngrasp.planning.collocation.window import EARLIEST, LATEST, Window
 from dyngrasp.planning.problem import MIN_INTERVALS, NodeConstraint, PhaseProblem, Solution, Status
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
@@ -72,24 +71,22 @@ _WORDS = {
 
 
 TOO_FAST = 1.05  # speed over its limit above which a guess is slowed down
-KEPT = 16  # problem sizes whose arrays, and solutions whose multipliers, are kept
+KEPT = 16  # problem sizes whose arrays are kept
 
 
 class StructuredSolver:
-    """Solves phases; keeps work arrays from one phase to the next, and the multipliers of its last solutions."""
+    """Solves phases; keeps work arrays from one phase to the next."""
 
     def __init__(self, settings: StructuredSettings | None = None) -> None:
         self.settings = settings or StructuredSettings()
         self._methods: dict[tuple, tuple[WorkArrays, InteriorPoint]] = {}
-        self._solved: list[_Solved] = []
 
     def solve(self, problem: PhaseProblem, guess: Trajectory | None = None) -> Solution:
         """Solve one phase.
 
         Args:
             problem: What is asked.
-            guess: Where to start if limits are active: a motion of any duration on any grid, as the rest of a plan. If
-                it is a trajectory that this solver returned lately, the solver starts from its multipliers too.
+            guess: Where to start if limits are active: a motion of any duration on any grid, as the rest of a plan.
 
         Returns:
             The solution. Failures are statuses; a trajectory is given even then, if there is a finite one, and it
@@ -129,22 +126,21 @@ class StructuredSolver:
             return Solution(Status.CONVERGED, optimum, objective, 0, violation, timings, message)
 
         start = closed_form.within_speed_limits(problem, T) if guess is None else on_grid(problem, guess)
-        known = self._multipliers(guess, problem.intervals, limits.rows_per_point)
         barrier = settings.initial_barrier if guess is None else settings.guess_barrier
-        deadline, cautious = began + settings.time_limit, guess is not None and known is None
-        if known is None:
-            narrow = self._solve_window(model, g, start, deadline, cautious)
-            if narrow is not None:
-                trajectory, multipliers, iterations = narrow
-                objective = model.values(model.map.unknowns(trajectory), trajectory.duration, g)
-                violation, _ = limits.violation(g, trajectory.duration)
-                if violation <= settings.violation_tolerance:
-                    self._remember(trajectory, multipliers, limits.rows_per_point)
-                    timings["total"] = 1e3 * (time.perf_counter() - began)
-                    message = f"{problem.name}: optimal, limits active at the end only"
-                    return Solution(Status.CONVERGED, trajectory, objective, iterations, violation, timings, message)
+        deadline = began + settings.time_limit
+        # Rows of positions alone are walls, and a guess stands on their right side.
+        cautious = guess is not None and not limits.free_at_ends.all()
+        narrow = self._solve_window(model, g, start, deadline, cautious)
+        if narrow is not None:
+            trajectory, iterations = narrow
+            objective = model.values(model.map.unknowns(trajectory), trajectory.duration, g)
+            violation, _ = limits.violation(g, trajectory.duration)
+            if violation <= settings.violation_tolerance:
+                timings["total"] = 1e3 * (time.perf_counter() - began)
+                message = f"{problem.name}: optimal, limits active at the end only"
+                return Solution(Status.CONVERGED, trajectory, objective, iterations, violation, timings, message)
         x, T = model.map.unknowns(start), start.duration
-        outcome, best, iterations = method.solve(model, x, T, deadline, barrier, known, cautious)
+        outcome, best, iterations = method.solve(model, x, T, deadline, barrier, cautious)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
@@ -155,18 +151,16 @@ class StructuredSolver:
         message = f"{problem.name}: {_WORDS[outcome]}"
         if violation > settings.violation_tolerance:
             message += f"; worst: {name} by {violation:.1e}"
-        if outcome is Outcome.OPTIMAL:
-            self._remember(trajectory, method.multiplier.copy(), limits.rows_per_point)
         timings["total"] = 1e3 * (time.perf_counter() - began)
         return Solution(_STATUS[outcome], trajectory, objective, iterations, violation, timings, message)
 
     def _solve_window(
         self, model: PhaseModel, g: Array, start: Trajectory, deadline: float, cautious: bool
-    ) -> tuple[Trajectory, Array, int] | None:
+    ) -> tuple[Trajectory, int] | None:
         """The optimum under those constraints alone that g violates, late and by its positions; None if that is not so.
 
         Returns:
-            The motion, the multipliers of all rows of the model if it satisfies them, and the iterations.
+            The motion, an optimum of the phase if it satisfies all rows of the model, and the iterations.
         """
         problem, limits = model.problem, model.limits
         violated = limits.violated_rows(g, self.settings.violation_tolerance)
@@ -186,20 +180,12 @@ class StructuredSolver:
         part = PhaseModel(problem, functions, inside, work, window)
         x = window.unknowns(model.map.unknowns(start))
         outcome, best, iterations = method.solve(
-            part, x, start.duration, deadline, self.settings.window_barrier, None, cautious
+            part, x, start.duration, deadline, self.settings.window_barrier, cautious
         )
         if outcome is not Outcome.OPTIMAL:
             return None
         curvature = window.curvature(problem, best.x, best.T)
-        trajectory = closed_form.nearest_trajectory(problem, curvature, best.T)
-        multipliers = np.zeros(model.rows)
-        at_points = multipliers[:-2].reshape(-1, limits.rows_per_point)
-        columns = np.isin(np.concatenate([owner[limits.lower_index], owner[limits.upper_index]]), chosen)
-        boxes = limits.rows_per_point - columns.size
-        at_points[first:, boxes + np.flatnonzero(columns)] = method.multiplier[:-2].reshape(-1, inside.rows_per_point)[
-            STANDING_FOR:
-        ]
-        return trajectory, multipliers, iterations
+        return closed_form.nearest_trajectory(problem, curvature, best.T), iterations
 
     def _kept(self, points: int, joints: int, limits: LimitRows) -> tuple[WorkArrays, InteriorPoint]:
         """Arrays of this problem size; those used longest ago make room."""
@@ -213,34 +199,6 @@ class StructuredSolver:
         while len(self._methods) > KEPT:
             del self._methods[next(iter(self._methods))]
         return kept
-
-    def _remember(self, trajectory: Trajectory, multipliers: Array, rows_per_point: int) -> None:
-        self._solved.append(_Solved(weakref.ref(trajectory), multipliers, rows_per_point))
-        self._solved = [solved for solved in self._solved if solved.trajectory() is not None][-KEPT:]
-
-    def _multipliers(self, guess: Trajectory | None, intervals: int, rows_per_point: int) -> Array | None:
-        """Multipliers of the solution that the guess is, brought to another grid; None if it is none of the last."""
-        for solved in self._solved:
-            if guess is not None and solved.trajectory() is guess and solved.rows_per_point == rows_per_point:
-                return solved.on_grid(intervals)
-        return None
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """A trajectory that was returned, and its multipliers (K · R + 2,)."""
-
-    trajectory: weakref.ref[Trajectory]
-    multipliers: Array
-    rows_per_point: int
-
-    def on_grid(self, intervals: int) -> Array:
-        """Multipliers on another grid; their sum over the grid points stays, as each stands for 1/N of the time."""
-        rows = self.multipliers[:-2].reshape(-1, self.rows_per_point)
-        old = np.linspace(0.0, 1.0, len(rows))
-        new = np.linspace(0.0, 1.0, intervals + 1)
-        at_points = np.stack([np.interp(new, old, column) for column in rows.T], axis=1)
-        return np.concatenate([at_points.ravel() * (len(rows) - 1) / intervals, self.multipliers[-2:]])
 
 
 def _refused(
@@ -287,4 +245,3 @@ def compile_kernels() -> None:
     for adaptive in (True, False):
         method = InteriorPoint(InteriorPointSettings(max_iterations=3, adaptive=adaptive))
         method.solve(model, x, 1.0)
-        method.solve(model, x, 1.0, multipliers=method.multiplier.copy())
