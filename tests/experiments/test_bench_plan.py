@@ -7,7 +7,7 @@ import pytest
 
 from dyngrasp.cli.arguments import argument_parser
 from dyngrasp.errors import DyngraspError
-from dyngrasp.experiments.bench_plan import SAME, Attempt, PlanBenchmark, bench_plan
+from dyngrasp.experiments.bench_plan import SAME, WARM, Attempt, PlanBenchmark, bench_plan
 from dyngrasp.experiments.output import write_json
 from dyngrasp.experiments.serial_chain import serial_chain
 
@@ -31,9 +31,10 @@ def test_every_trial_and_stage_is_there(measured):
 
 def test_phases_are_solved_and_measured_independently(measured):
     rows = measured.phase_rows()
-    assert len(rows) == 6
+    assert [row["solver"] for row in rows].count(WARM) == 6
+    assert len(rows) == 12
     for row in rows:
-        assert row["ok"] == 2
+        assert row["ok"] == row["n"] == 2
         assert row["worst_violation"] <= 1e-9
         assert row["objective"] > 0
 

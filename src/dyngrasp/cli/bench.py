@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dyngrasp.cli.arguments import DELIVERED
-from dyngrasp.experiments.bench_plan import CASES, PEERS, PlanBenchmark, bench_plan
+from dyngrasp.experiments.bench_plan import CASES, MOVE, PEERS, WARM, PlanBenchmark, bench_plan
 from dyngrasp.experiments.bench_replan import MOVES, bench_replan
 from dyngrasp.experiments.output import check_writable, write_json
 from dyngrasp.experiments.provenance import machine, versions
@@ -29,6 +29,7 @@ def bench(options: argparse.Namespace) -> int:
         found = bench_plan(options.trials, options.seed, tuple(options.rho), against, status.update)
     for name, words in CASES.items():
         console.print(f"[bold]{name}[/]: {words}")
+    console.print(f"[bold]{WARM}[/]: after the part has moved by {100 * MOVE:g} cm, from the solution before")
     for name in found.peers:
         console.print(f"[bold]{name}[/]: {PEERS[name][0]}")
     for table in tables(found):

@@ -44,6 +44,10 @@ CASES = {
     "stress": "random start postures, half of the torque limits",
 }
 
+WARM = "warm"
+"""The default solver on a problem whose part has moved by `MOVE` (m), from the solution before."""
+MOVE = 0.01
+
 # Objectives that differ by less are those of one optimum (relative).
 SAME = 1e-5
 GRIDS = (50, 100, 200, 400, 800)
@@ -205,6 +209,7 @@ def bench_plan(
                 progress(f"{case}, ρ = {weight:g}: {trial + 1} of {trials}")
                 stages += _plan(case, weight, trial, planner, T, q_start, task)
                 attempts += _phases(case, weight, trial, planner, T, q_start, task, solvers)
+                attempts += _after_a_move(case, weight, trial, planner, T, q_start, task)
     progress("growth with N and with the number of joints")
     growth = tuple(_growth(solvers["structured"], min(trials, 20), seed, grids, joints))
     return PlanBenchmark(tuple(attempts), tuple(stages), growth, tuple(against))
@@ -287,6 +292,26 @@ def _phases(
             solution = solver.solve(problem, guess)
             elapsed = 1e3 * (time.perf_counter() - began)
             attempts.append(_attempt(case, weight, trial, phase, name, elapsed, problem, solution))
+    return attempts
+
+
+def _after_a_move(
+    case: str, weight: float, trial: int, planner: CollocationPlanner, T: pin.SE3, q_start: Array, task: GraspTask
+) -> list[Attempt]:
+    """The three phases after the part has moved, each from its solution before; nothing if it is then out of reach."""
+    angle = trial * np.pi * (3 - np.sqrt(5))
+    moved = pin.SE3(T.rotation, T.translation + MOVE * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    before, attempts = grasp_targets(T, task, q_start), []
+    try:
+        after = planner.phase_problems(q_start, grasp_targets(moved, task, q_start))
+    except DyngraspError:
+        return []
+    for phase, problem, new in zip(PHASE_NAMES, planner.phase_problems(q_start, before), after, strict=True):
+        known = planner.solver.solve(problem, planner.guess(problem, before)).trajectory
+        began = time.perf_counter()
+        solution = planner.solver.solve(new, known)
+        elapsed = 1e3 * (time.perf_counter() - began)
+        attempts.append(_attempt(case, weight, trial, phase, WARM, elapsed, new, solution))
     return attempts
 
 
