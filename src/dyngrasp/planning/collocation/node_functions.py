@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import logging
+from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 import casadi as ca
@@ -21,6 +23,9 @@ from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.signals import Array
 
 _log = logging.getLogger(__name__)
+
+
+Evaluation = Callable[[], object]
 
 
 class NodeFunctions(Protocol):
@@ -63,6 +68,12 @@ class NodeFunctions(Protocol):
             hessian: (K, 2n, 2n), added to.
             column: As for `values`.
         """
+        ...
+
+    def bound(
+        self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
+    ) -> tuple[Evaluation, Evaluation]:
+        """`values` and `derivatives` on arrays that outlive the answer: to call again and again at no further cost."""
         ...
 
 
@@ -136,6 +147,15 @@ class InterpretedNodeFunctions:
         jacobian[:, here] = rows.full().T.reshape(K, self.rows, 2 * n)
         hessian += curvature.full().T.reshape(K, 2 * n, 2 * n)
 
+    def bound(
+        self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
+    ) -> tuple[Evaluation, Evaluation]:
+        """See `NodeFunctions`."""
+        return (
+            partial(self.values, q, v, p, g, column),
+            partial(self.derivatives, q, v, p, weights, g, jacobian, hessian, column),
+        )
+
 
 class CompiledNodeFunctions:
     """Machine code from the cache.
@@ -160,24 +180,28 @@ class CompiledNodeFunctions:
 
     def values(self, q: Array, v: Array, p: Array, g: Array, column: int) -> None:
         """See `NodeFunctions`."""
-        total = g.shape[1]
-        self._values(len(q), q.ctypes.data, v.ctypes.data, p.ctypes.data, g.ctypes.data + 8 * column, total)
+        rows, total = g.ctypes.data + 8 * column, g.shape[1]
+        self._values(len(q), q.ctypes.data, v.ctypes.data, p.ctypes.data, rows, total)
 
     def derivatives(
         self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
     ) -> None:
         """See `NodeFunctions`."""
-        total = g.shape[1]
-        self._derivatives(
-            len(q),
-            q.ctypes.data,
-            v.ctypes.data,
-            p.ctypes.data,
-            weights.ctypes.data + 8 * column,
-            g.ctypes.data + 8 * column,
-            jacobian.ctypes.data + 8 * column * jacobian.shape[2],
-            hessian.ctypes.data,
-            total,
+        self.bound(q, v, p, weights, g, jacobian, hessian, column)[1]()
+
+    def bound(
+        self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
+    ) -> tuple[Evaluation, Evaluation]:
+        """See `NodeFunctions`."""
+        points, total, at = len(q), g.shape[1], 8 * column
+        here = (q.ctypes.data, v.ctypes.data, p.ctypes.data)
+        rows = g.ctypes.data + at
+        slopes = jacobian.ctypes.data + at * jacobian.shape[2]
+        return (
+            partial(self._values, points, *here, rows, total),
+            partial(
+                self._derivatives, points, *here, weights.ctypes.data + at, rows, slopes, hessian.ctypes.data, total
+            ),
         )
 
 

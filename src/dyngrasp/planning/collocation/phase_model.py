@@ -59,6 +59,11 @@ class PhaseModel:
             self.parameters = tuple(constraint.parameters for constraint in problem.constraints)
         else:
             self.map, self.effort_weight, self.parameters = window.map, window.effort_weight, window.parameters
+        arrays = (work.weights, work.c, work.jacobian, work.hessian)
+        self._evaluations, column = [], 0
+        for parameters, function in zip(self.parameters, functions, strict=True):
+            self._evaluations.append(function.bound(work.z[POSITION], work.v, parameters, *arrays, column))
+            column += function.rows
         self.factor = 1.0
         self.corner = self.complement = np.nan
         self._arguments = limits.arguments
@@ -82,10 +87,9 @@ class PhaseModel:
     def values(self, x: Array, T: float, g: Array) -> float:
         """Move to a point, write its rows g, and return the objective."""
         self._place(x, T)
-        work, column = self.work, 0
-        for parameters, function in zip(self.parameters, self.functions, strict=True):
-            function.values(work.z[POSITION], work.v, parameters, work.c, column)
-            column += function.rows
+        work = self.work
+        for evaluate, _ in self._evaluations:
+            evaluate()
         return _rows_and_objective(work.z, T, work.c, self._arguments, self.effort_weight, g)
 
     def violation_at_the_ends(self) -> tuple[float, str]:
@@ -105,21 +109,11 @@ class PhaseModel:
     def derivatives(self, x: Array, T: float, multiplier: Array, g: Array) -> float:
         """As `values`, and prepare everything below for this point and these multipliers."""
         self._place(x, T)
-        work, column = self.work, 0
+        work = self.work
         limit_rows.constraint_weights(multiplier, self._arguments, work.weights)
         work.hessian[:] = 0.0
-        for parameters, function in zip(self.parameters, self.functions, strict=True):
-            function.derivatives(
-                work.z[POSITION],
-                work.v,
-                parameters,
-                work.weights,
-                work.c,
-                work.jacobian,
-                work.hessian,
-                column,
-            )
-            column += function.rows
+        for _, evaluate in self._evaluations:
+            evaluate()
         return _rows_and_objective(work.z, T, work.c, self._arguments, self.effort_weight, g)
 
     def descent(self, y: Array, out: Array) -> float:

@@ -166,7 +166,7 @@ class StructuredSolver:
         violated = limits.violated_rows(g, self.settings.violation_tolerance)
         if violated is None or limits.free_at_ends[violated[0]].any():
             return None
-        step = max(problem.intervals // 10, 1)
+        step = max(problem.intervals // 20, 1)
         first = step * (violated[1] // step - 1)
         if not EARLIEST <= first <= problem.intervals - LATEST:
             return None
