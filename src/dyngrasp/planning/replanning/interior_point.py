@@ -110,6 +110,8 @@ def interior_point(
         least = min(least, g[i])
     floor = max(-least, 1e-2)
     s, lam, omega, target = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    # Divisions are the dearest of what is done for a row.
+    per_s, per_lam = np.empty(m), np.empty(m)
     ds, dlam, dg = np.zeros(m), np.zeros(m), np.zeros(m)
     mu = 0.1 * unit / max(used, 1)
     for i in range(used):
@@ -178,7 +180,8 @@ def interior_point(
         column[:] = base_column
         c_T = corner
         for i in range(used):
-            omega[i] = lam[i] / s[i]
+            per_s[i], per_lam[i] = 1.0 / s[i], 1.0 / lam[i]
+            omega[i] = lam[i] * per_s[i]
             c_T += omega[i] * cs[i] * cs[i]
             if i < rows:
                 kind, k, j = kinds[i], nodes[i], joints[i]
@@ -201,12 +204,11 @@ def interior_point(
         else:
             complement = 1.0
         sigma_mu = 0.0
-        step_primal, step_dual = 1.0, 1.0
         for corrected in range(2):
             # Right-hand side: −∇f + Gᵀ((σμ − Δs Δλ)/s − ω (g − s)), for Δs = GΔ + g − s, Δλ = … .
             for i in range(used):
                 second = ds[i] * dlam[i] if corrected == 1 else 0.0
-                target[i] = (sigma_mu - second) / s[i] - omega[i] * (g[i] - s[i])
+                target[i] = (sigma_mu - second) * per_s[i] - omega[i] * (g[i] - s[i])
             step[:] = -gradient
             r_T = -g_T + _scatter(target, rows, used, kinds, nodes, joints, signs, scales, cs, first, taps, step)
             dT = 0.0
@@ -232,16 +234,15 @@ def interior_point(
                     change -= scales[i] * signs[i] * along
                 dg[i] = change
             keep = 1.0 if corrected == 0 else 0.995
-            step_primal, step_dual = 1.0, 1.0
+            shrink_primal, shrink_dual = keep, keep
             for i in range(used):
                 second = ds[i] * dlam[i] if corrected == 1 else 0.0
                 ds_i = dg[i] + g[i] - s[i]
-                dlam_i = (sigma_mu - second) / s[i] - lam[i] - omega[i] * ds_i
+                dlam_i = (sigma_mu - second) * per_s[i] - lam[i] - omega[i] * ds_i
                 ds[i], dlam[i] = ds_i, dlam_i
-                if ds_i < 0:
-                    step_primal = min(step_primal, -keep * s[i] / ds_i)
-                if dlam_i < 0:
-                    step_dual = min(step_dual, -keep * lam[i] / dlam_i)
+                shrink_primal = max(shrink_primal, -ds_i * per_s[i])
+                shrink_dual = max(shrink_dual, -dlam_i * per_lam[i])
+            step_primal, step_dual = keep / shrink_primal, keep / shrink_dual
             if corrected == 0:
                 after = 0.0
                 for i in range(used):
