@@ -9,8 +9,9 @@ import pinocchio as pin
 import pytest
 
 from dyngrasp.models.distance_bounds import Capsules
-from dyngrasp.planning.audit import SUBSTEPS, audit, standstill
+from dyngrasp.planning.audit import audit, standstill
 from dyngrasp.planning.clearance import cell_geometry
+from dyngrasp.planning.plan_samples import SUBSTEPS
 from dyngrasp.planning.problem import AuditEntry
 from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -23,17 +22,10 @@ from dyngrasp.models.kinematic_tree import frames_named
 from dyngrasp.models.pinch import pad_loads
 from dyngrasp.planning.clearance import clearance_entries, waypoints_of
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.plan_samples import PlanSamples, Row, at_grid_points, between, worse
 from dyngrasp.planning.problem import AuditEntry, AuditReport
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, Trajectory, largest_difference
-
-# Samples of an interval between two grid points in which a constraint could be broken: a velocity, quadratic in
-# between, is then seen to 1/256 of its height.
-SUBSTEPS = 16
-
-# A function of the motion departs from the chord between two grid points by about an eighth of its second difference
-# there. An interval is looked into where four times that could break a constraint.
-CURVATURE_FACTOR = 4.0 / 8.0
 
 # An arm slower than this, in parts of its joints' speed limits, has come to a standstill: half as much again as what is
 # called one when an episode is judged, for tracking is not exact. At both ends of a plan this part of it may be slower.
@@ -47,54 +39,6 @@ LENGTH_TOLERANCE = 1e-6
 
 # The trapezoid between two grid points of a curved tube or funnel leaves it by a chord's height (m).
 CHORD_TOLERANCE = 5e-5
-
-
-@dataclass(frozen=True)
-class _Samples:
-    """A plan at some times: on its clock (M,), arm (n, M) and gripper (m, M) states.
-
-    `phases` are the three slices of M.
-    """
-
-    phases: tuple[slice, slice, slice]
-    times: Array
-    q: Array
-    w: Array
-    v: Array
-    q_h: Array
-    w_h: Array
-    v_h: Array
-
-    def arm(self, part: slice) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration of the arm in some of the samples."""
-        return tuple(np.ascontiguousarray(x[:, part]) for x in (self.q, self.w, self.v))  # type: ignore[return-value]
-
-
-@dataclass(frozen=True)
-class _Row:
-    """One constraint at the samples from `first` on: values (k, m) that must not exceed a bound, or not fall below.
-
-    `names` are those of the k values. `straight` says that between two grid points they are linear.
-    """
-
-    name: str
-    values: Array
-    first: int
-    bound: float
-    tolerance: float
-    unit: str
-    at_least: bool = False
-    names: tuple[str, ...] = ()
-    straight: bool = False
-
-    def entry(self, times: Array) -> AuditEntry:
-        """The worst value; `times` (M,) are those of all samples."""
-        # numpy's argmax and argmin stop at a NaN: it is the worst value there can be.
-        flat = int(self.values.argmin() if self.at_least else self.values.argmax())
-        which, k = divmod(flat, self.values.shape[1])
-        time, detail = float(times[self.first + k]), self.names[which] if self.names else ""
-        worst = float(self.values[which, k])
-        return AuditEntry(self.name, worst, self.bound, self.at_least, self.tolerance, self.unit, time, detail)
 
 
 class _Models:
@@ -157,14 +101,13 @@ def audit(
         executed.
     """
     models = _models(task, targets.grasp.name)
-    grid = _at_grid_points(plan, since)
+    grid = at_grid_points(plan, since)
     rows = _rows(grid, plan, targets, task, models, wall)
     worst = [row.entry(grid.times) for row in rows]
-    between = _between(plan, grid, rows)
-    if between is not None:
-        finer = _rows(between, plan, targets, task, models, wall)
-        inside = {row.name: row.entry(between.times) for row in finer}
-        worst = [_worse(entry, inside.get(entry.name, entry)) for entry in worst]
+    finer = between(plan, grid, rows)
+    if finer is not None:
+        inside = {row.name: row.entry(finer.times) for row in _rows(finer, plan, targets, task, models, wall)}
+        worst = [worse(entry, inside.get(entry.name, entry)) for entry in worst]
     entries = [
         _dynamics(plan),
         *_joins(plan),
@@ -224,13 +167,13 @@ def _slowest(duration, velocity, acceleration, limit, first, last):
 
 
 def _rows(
-    samples: _Samples,
+    samples: PlanSamples,
     plan: GraspPlan,
     targets: GraspTargets,
     task: GraspTask,
     models: _Models,
     wall: Callable[[Array], Array],
-) -> list[_Row]:
+) -> list[Row]:
     """The constraints on every sample; those of a phase without samples are left out."""
     approach, grasp, deliver = samples.phases
     empty = slice(0, grasp.stop)
@@ -239,7 +182,7 @@ def _rows(
     torques[:, empty], _ = models.empty.inverse_dynamics(*samples.arm(empty))
     torques[:, deliver], motion = models.loaded.inverse_dynamics(*samples.arm(deliver))
     ratios = np.abs(torques) / task.robot.limits.torque[:, None]
-    rows.append(_Row("torque", ratios, 0, 1.0, RATIO_TOLERANCE, "of limit", names=plan.arm_joints))
+    rows.append(Row("torque", ratios, 0, 1.0, RATIO_TOLERANCE, "of limit", names=plan.arm_joints))
     if empty.stop:
         R, G = models.hand(samples.q[:, empty], samples.q_h[:, empty])
         G, angles = _seen_from_grasp(R, G, samples.times[empty], targets)
@@ -250,82 +193,6 @@ def _rows(
     if deliver.stop > deliver.start:
         rows.append(_hold(motion, deliver.start, models))
     return rows
-
-
-def _at_grid_points(plan: GraspPlan, since: float) -> _Samples:
-    """The plan on its grids, and at `since`; on the finer one where arm and gripper have different grids."""
-    chosen = []
-    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), strict=True):
-        local = arm.times if arm.intervals >= gripper.intervals else gripper.times
-        cut = since - (T - arm.duration)
-        if cut > 0.0:
-            local = np.concatenate([[cut], local[local > cut]]) if since < T else np.empty(0)
-        chosen.append(local)
-    return _sampled(plan, chosen)
-
-
-def _sampled(plan: GraspPlan, chosen: list[Array]) -> _Samples:
-    """The plan at times of each phase, counted from its beginning (s)."""
-    tables, phases, end = [], [], 0
-    for arm, gripper, T, local in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), chosen, strict=True):
-        tables.append((T - arm.duration + local, *_states(arm, local), *_states(gripper, local)))
-        phases.append(slice(end, end + local.size))
-        end += local.size
-    return _Samples(
-        tuple(phases), *(np.ascontiguousarray(np.concatenate(column).T) for column in zip(*tables, strict=True))
-    )
-
-
-def _states(trajectory: Trajectory, local: Array) -> tuple[Array, Array, Array]:
-    """`Trajectory.sample_many`, for nothing where all grid points are asked for."""
-    if local.size == trajectory.intervals + 1 and local[0] == 0.0:
-        return trajectory.position, trajectory.velocity, trajectory.acceleration
-    return trajectory.sample_many(local)
-
-
-def _between(plan: GraspPlan, grid: _Samples, rows: list[_Row]) -> _Samples | None:
-    """Samples inside the intervals in which a constraint could be broken; None if there is no such interval."""
-    suspects = np.zeros(grid.times.size, dtype=np.bool_)
-    for row in rows:
-        if not row.straight:
-            sign = -1.0 if row.at_least else 1.0
-            _mark_suspects(row.values, row.bound, sign, suspects[row.first : row.first + row.values.shape[1]])
-    for part in grid.phases:
-        # What follows the last sample of a phase is a join: no time passes there.
-        suspects[part.stop - 1 : part.stop] = False
-    if not suspects.any():
-        return None
-    chosen = []
-    for arm, T, part in zip(plan.arm, plan.phase_ends.tolist(), grid.phases, strict=True):
-        local = grid.times[part] - (T - arm.duration)
-        k = np.flatnonzero(suspects[part])
-        inside = local[k, None] + np.diff(local)[k, None] * (np.arange(1, SUBSTEPS) / SUBSTEPS)
-        chosen.append(inside.ravel())
-    return _sampled(plan, chosen)
-
-
-@njit(cache=True)
-def _mark_suspects(values, bound, sign, suspects):
-    """Mark the intervals between samples of values (k, m) in which the bound is not farther than they may bend."""
-    last = values.shape[1] - 1
-    for j in range(values.shape[0]):
-        row = values[j]
-        for k in range(last):
-            bend = 0.0
-            if k > 0:
-                bend = abs(row[k - 1] - 2.0 * row[k] + row[k + 1])
-            if k + 2 <= last:
-                bend = max(bend, abs(row[k] - 2.0 * row[k + 1] + row[k + 2]))
-            slack = min(sign * (bound - row[k]), sign * (bound - row[k + 1]))
-            # A NaN is suspect as well.
-            if not slack >= CURVATURE_FACTOR * bend:
-                suspects[k] = True
-
-
-def _worse(one: AuditEntry, other: AuditEntry) -> AuditEntry:
-    """The entry with the worse value, of one constraint; NaN is worst."""
-    sign = -1.0 if one.at_least else 1.0
-    return one if not sign * other.worst > sign * one.worst and not np.isnan(other.worst) else other
 
 
 def _dynamics(plan: GraspPlan) -> AuditEntry:
@@ -402,7 +269,7 @@ def _angles(R: Array, other: Array) -> Array:
     return 2 * np.arcsin(np.minimum(chord, 1.0))
 
 
-def _boxes(samples: _Samples, plan: GraspPlan, task: GraspTask) -> list[_Row]:
+def _boxes(samples: PlanSamples, plan: GraspPlan, task: GraspTask) -> list[Row]:
     """Positions, velocities and accelerations of arm and gripper as parts of their limits."""
     limits, gripper = task.robot.limits, task.gripper
     table = (
@@ -414,7 +281,7 @@ def _boxes(samples: _Samples, plan: GraspPlan, task: GraspTask) -> list[_Row]:
         ("gripper_acceleration", np.abs(samples.v_h) / gripper.acceleration[:, None], plan.gripper_joints),
     )
     return [
-        _Row(name, values, 0, 1.0, RATIO_TOLERANCE, "of limit", names=names, straight=name.endswith("acceleration"))
+        Row(name, values, 0, 1.0, RATIO_TOLERANCE, "of limit", names=names, straight=name.endswith("acceleration"))
         for name, values, names in table
     ]
 
@@ -424,26 +291,26 @@ def _off_centre(q: Array, lower: Array, upper: Array) -> Array:
     return np.abs(q - ((upper + lower) / 2)[:, None]) / ((upper - lower) / 2)[:, None]
 
 
-def _funnel(G: Array, wall: Array, task: GraspTask) -> _Row:
+def _funnel(G: Array, wall: Array, task: GraspTask) -> Row:
     """h(q) of eq. (6): how high G (m, 3) is in the grasp frame above the inverted Gaussian of eq. (5) times `wall`."""
     funnel = task.grasp_object.funnel
     x, y, z = G.T
     bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
     height = z - wall * funnel.z_threshold * (1.0 - bell)
-    return _Row("funnel", height[None], 0, 0.0, CHORD_TOLERANCE, "m", at_least=True)
+    return Row("funnel", height[None], 0, 0.0, CHORD_TOLERANCE, "m", at_least=True)
 
 
-def _reversal(G: Array, angles: Array, first: int, task: GraspTask) -> list[_Row]:
+def _reversal(G: Array, angles: Array, first: int, task: GraspTask) -> list[Row]:
     """G stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes."""
     settings, (x, y, z) = task.settings, G.T
     return [
-        _Row("grasp_axis", np.hypot(x, y)[None], first, settings.lateral_tolerance, CHORD_TOLERANCE, "m"),
-        _Row("grasp_dip", z[None], first, -settings.dip_tolerance, CHORD_TOLERANCE, "m", at_least=True),
-        _Row("grasp_tilt", angles[None], first, settings.tilt_tolerance, 1e-4, "rad"),
+        Row("grasp_axis", np.hypot(x, y)[None], first, settings.lateral_tolerance, CHORD_TOLERANCE, "m"),
+        Row("grasp_dip", z[None], first, -settings.dip_tolerance, CHORD_TOLERANCE, "m", at_least=True),
+        Row("grasp_tilt", angles[None], first, settings.tilt_tolerance, 1e-4, "rad"),
     ]
 
 
-def _hold(motion: Array, first: int, models: _Models) -> _Row:
+def _hold(motion: Array, first: int, models: _Models) -> Row:
     """Share of its friction that the busier pad needs to carry the part, velocity terms included.
 
     The safety factor of the planner is not applied here: at 1 the part would just slip.
@@ -453,4 +320,4 @@ def _hold(motion: Array, first: int, models: _Models) -> _Row:
     moment = T.rotation.T @ (wrench[3:] - pin.skew(T.translation) @ wrench[:3])
     loads = pad_loads(force, moment, models.pinch)
     shares = [np.sqrt(load) / np.maximum(normal, 1e-9) for load, normal in loads]
-    return _Row("hold", np.maximum(*shares)[None], first, 1.0, RATIO_TOLERANCE, "of the grip")
+    return Row("hold", np.maximum(*shares)[None], first, 1.0, RATIO_TOLERANCE, "of the grip")

@@ -343,7 +343,7 @@ def _equidistant(arm: Trajectory, gripper: Trajectory, start: float) -> Array:
     finer = max(arm.intervals, gripper.intervals)
     grid = arm.times if arm.intervals == finer else gripper.times
     both = [x.position if x.intervals == finer else x.sample_many(grid)[0] for x in (arm, gripper)]
-    return _times_along(grid, *both, start, JOINT_STEP)
+    return _times_along(grid, both[0], both[1], start, JOINT_STEP)
 
 
 @njit(cache=True)
