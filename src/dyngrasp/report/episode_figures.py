@@ -61,4 +61,5 @@ def episode_figure(
         task.robot.joint_names,
         task.gripper.joint_names,
         title,
+        planned_name="planned" if last is None or last is plan else "first plan",
     )

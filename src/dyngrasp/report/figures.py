@@ -82,6 +82,7 @@ def trajectory_figure(
     gripper_joint_names: Sequence[str],
     title: str = "",
     moving_threshold: float = 0.01,
+    planned_name: str = "planned",
 ) -> Figure:
     """Scaled positions, speeds and torques over time, in the form of the paper's Figure 5.
 
@@ -99,6 +100,7 @@ def trajectory_figure(
         gripper_joint_names: m names.
         title: Set over the figure.
         moving_threshold: The least max-norm of q̇/q̇max that counts as moving.
+        planned_name: What the legend calls the plan.
     """
     n, m = len(joint_names), len(gripper_joint_names)
     colours, gripper_colours = _colours(n), _colours(m)
@@ -128,7 +130,8 @@ def trajectory_figure(
         axes[-1].set_xlabel("time (s)")
         _name_phases(axes[0], np.concatenate([[planned.times[0]], phase_ends]))
         figure.align_ylabels(axes)
-        _legends(axes, joint_names, colours, gripper_joint_names, gripper_colours, measured is not None)
+        motions = (planned_name,) if measured is None else (planned_name, "measured")
+        _legends(axes, joint_names, colours, gripper_joint_names, gripper_colours, motions)
         if title:
             figure.suptitle(title, x=0.02, ha="left", fontsize=10.5, fontweight="bold", color=INK)
     return figure
@@ -264,14 +267,13 @@ def _legends(
     colours: list[Any],
     gripper_names: Sequence[str],
     gripper_colours: list[Any],
-    has_measured: bool,
+    motions: tuple[str, ...],
 ) -> None:
     beside = {"loc": "upper left", "bbox_to_anchor": (1.015, 1.03), "borderaxespad": 0.0, "handlelength": 1.7}
     joints = [Line2D([], [], color=c, lw=2.0, label=name) for name, c in zip(joint_names, colours, strict=True)]
     axes[0].legend(handles=joints, title="joint", alignment="left", title_fontsize=8, **beside)
-    lines = [Line2D([], [], color=INK, lw=0.9, ls=(0, (4, 2.2)), label="planned")]
-    if has_measured:
-        lines.append(Line2D([], [], color="#4a4a52", lw=1.8, label="measured"))
+    styles = ({"color": INK, "lw": 0.9, "ls": (0, (4, 2.2))}, {"color": "#4a4a52", "lw": 1.8})
+    lines = [Line2D([], [], label=name, **style) for name, style in zip(motions, styles, strict=False)]
     lines.append(Line2D([], [], color=INK, lw=0.7, ls=(0, (1, 1.5)), label="limit"))
     axes[1].legend(handles=[*lines, Patch(color=PHASE_GREY, label="grasp phase")], **beside)
     hand = [Line2D([], [], color=c, lw=2.0, label=name) for name, c in zip(gripper_names, gripper_colours, strict=True)]

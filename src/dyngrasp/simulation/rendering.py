@@ -38,6 +38,9 @@ class View:
 OVERVIEW = View()
 """Arm, part and target in one picture."""
 
+WIDE = View(lookat=(0.36, -0.14, 0.40), distance=2.05, elevation_deg=-19.0)
+"""The same and the whole way of a part that rides on a conveyor."""
+
 
 def close_up(point: ArrayLike) -> View:
     """A view of the fingers about a point (m)."""
@@ -77,16 +80,18 @@ class Renderer:
         self._data = mujoco.MjData(model)
         self._camera = mujoco.MjvCamera()
 
-    def frame(self, state: ArrayLike, view: View = OVERVIEW) -> Frame:
+    def frame(self, state: ArrayLike, view: View | None = None) -> Frame:
         """One picture.
 
         Args:
             state: (nq,) generalised positions as `MujocoPlant.state` gives and the record keeps them.
-            view: Where the camera stands.
+            view: Where the camera stands; if left out, where it sees everything that happens.
 
         Returns:
             (height, width, 3) uint8.
         """
+        if view is None:
+            view = OVERVIEW if self._scene.conveyor is None else WIDE
         model, data = self._scene.model, self._data
         data.qpos[:] = np.asarray(state, dtype=float)
         mujoco.mj_kinematics(model, data)
