@@ -1,5 +1,8 @@
 """The end of a phase as a problem of its own."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -77,3 +80,39 @@ def test_an_approach_solved_by_its_end_is_an_optimum_of_the_whole(task, targets,
     assert again.ok
     assert again.objective == pytest.approx(solution.objective, rel=1e-7)
     np.testing.assert_allclose(again.require().position, solution.require().position, atol=1e-5)
+
+
+FRESH_PROCESS = """
+import importlib, pkgutil
+import numpy as np, pinocchio as pin
+from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
+from dyngrasp.planning import collocation
+from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
+from dyngrasp.planning.collocation.structured import compile_kernels
+from dyngrasp.planning.grasp_targets import GraspTask, grasp_targets
+
+names = [module.name for module in pkgutil.iter_modules(collocation.__path__)]
+modules = [importlib.import_module(f"{collocation.__name__}.{name}") for name in names]
+kernels = {f.py_func.__name__: f for module in modules for f in vars(module).values() if hasattr(f, "signatures")}
+
+def compiled():
+    return {name: len(f.signatures) for name, f in kernels.items()}
+
+compile_kernels()
+prepared = compiled()
+assert len(prepared) > 20
+place = np.deg2rad([-45.0, 34.0, 0.0, -53.0, 0.0, 93.0, 90.0])
+task = GraspTask(load_robot("iiwa14"), load_gripper("sdh2"), load_object("casting"), place)
+q = np.deg2rad([55.0, 39.5, -6.6, -22.0, -36.3, 110.6, 134.0])
+targets = grasp_targets(pin.SE3(np.eye(3), np.array([0.65, 0.0, task.grasp_object.rest_height])), task, q)
+for weight in (1.0, 1e-3):
+    result = CollocationPlanner(task, CollocationSettings(effort_weight=weight)).plan(q, targets)
+    assert result.ok and result.phases[0].iterations > 0, result.message
+assert compiled() == prepared, {name: (n, compiled()[name]) for name, n in prepared.items() if compiled()[name] != n}
+"""
+
+
+def test_solves_compile_nothing_but_what_was_prepared():
+    """What is compiled within a solve would count towards its time limit."""
+    done = subprocess.run([sys.executable, "-c", FRESH_PROCESS], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr

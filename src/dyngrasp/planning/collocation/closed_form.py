@@ -265,7 +265,7 @@ def rest_to_rest(intervals: int) -> tuple[Array, Array, Array]:
     """Position, rate and curvature, each (N+1,), of the least-effort motion from 0 to 1 at rest, in normalised time."""
     rows, _, gram_inverse = _end_map(intervals)
     curvature = rows.T @ (gram_inverse @ np.array([0.0, 1.0]))
-    position, rate = integrate(np.zeros(1), np.zeros(1), curvature[:, None])
+    position, rate = integrate(read_only(np.zeros(1)), np.zeros(1), curvature[:, None])
     # The motion is odd about its middle; averaging with its mirror image takes the summed rounding out of both ends.
     symmetric_rate = (rate[:, 0] + rate[::-1, 0]) / 2
     symmetric_position = (position[:, 0] + 1.0 - position[::-1, 0]) / 2

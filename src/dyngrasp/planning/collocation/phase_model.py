@@ -94,17 +94,16 @@ class PhaseModel:
 
     def violation_at_the_ends(self) -> tuple[float, str]:
         """Worst violation of rows that the boundary positions alone decide, at the current point, and their name."""
-        work, limits, column = self.work, self.limits, 0
-        found = (0.0, "")
-        for constraint, function in zip(self.problem.constraints, self.functions, strict=True):
-            here = slice(column, column + function.rows)
-            g = work.c[[0, -1], here] * limits.inverse_scale[here]
-            outside = np.maximum(limits.lower[here] - g, g - limits.upper[here])[:, ~function.depends_on_acceleration]
-            worst = float(outside.max(initial=0.0))
-            if not worst <= found[0]:
-                found = (worst, constraint.name)
-            column += function.rows
-        return found
+        limits = self.limits
+        g = self.work.c[[0, -1]] * limits.inverse_scale
+        outside = np.maximum(limits.lower - g, g - limits.upper)[:, limits.free_at_ends == 0.0]
+        worst = float(outside.max(initial=0.0))
+        if worst <= 0.0:
+            return 0.0, ""
+        # Which constraint it is matters in messages alone. A NaN is the largest number there is.
+        row = np.flatnonzero(limits.free_at_ends == 0.0)[int(outside.max(axis=0).argmax())]
+        names = [c.name for c, f in zip(self.problem.constraints, self.functions, strict=True) for _ in range(f.rows)]
+        return worst, names[row]
 
     def derivatives(self, x: Array, T: float, multiplier: Array, g: Array) -> float:
         """As `values`, and prepare everything below for this point and these multipliers."""

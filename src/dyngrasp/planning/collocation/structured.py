@@ -240,8 +240,9 @@ def compile_kernels() -> None:
     limits = LimitRows.of(problem, functions)
     work = WorkArrays(MIN_INTERVALS + 1, 1, limits.constraint_rows, limits.rows_per_point)
     model = PhaseModel(problem, functions, limits, work)
-    start = closed_form.least_effort(problem, 1.0)
+    start = closed_form.unconstrained_optimum(problem)
     x = model.map.unknowns(start)
+    model.map.expand(x, 1.0)
     for adaptive in (True, False):
         method = InteriorPoint(InteriorPointSettings(max_iterations=3, adaptive=adaptive))
         method.solve(model, x, 1.0)

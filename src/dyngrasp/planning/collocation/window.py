@@ -60,6 +60,9 @@ class Window:
         taps[:STANDING_FOR, :2, CURVATURE] = factor.T
         offset[CURVATURE, :STANDING_FOR] = -factor.T @ np.tile(problem.start_position, (2, 1))
         slope[CURVATURE, :STANDING_FOR] = -factor.T @ (at * problem.start_velocity)
+        # As those of the whole grid are: compiled code is made for read-only arrays, once.
+        index.setflags(write=False)
+        taps.setflags(write=False)
         parameters = tuple(c.parameters[[first, first, *range(first, N + 1)]] for c in constraints)
         weight = problem.effort_weight * (points - 1) / N
         return cls(first, ThreeTap(index, taps, offset, slope), parameters, weight)
