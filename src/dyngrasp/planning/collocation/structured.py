@@ -37,8 +37,7 @@ class StructuredSettings:
         violation_tolerance: Largest violation that counts as none, in units of each limit.
         max_iterations: Of the interior point method.
         time_limit: Wall time for one phase (s); after it the best iterate is returned.
-        initial_barrier: Barrier parameter of a cold start, relative to the objective.
-        guess_barrier: The same where a guess is given: a larger one would drive it away.
+        initial_barrier: Barrier parameter at the start, relative to the objective.
         window_barrier: The same where only the end of the motion is sought, under few rows.
     """
 
@@ -46,8 +45,7 @@ class StructuredSettings:
     violation_tolerance: float = 1e-9
     max_iterations: int = 500
     time_limit: float = 5.0
-    initial_barrier: float = 1e-3
-    guess_barrier: float = 1e-4
+    initial_barrier: float = 1e-4
     window_barrier: float = 1e-5
 
 
@@ -126,7 +124,6 @@ class StructuredSolver:
             return Solution(Status.CONVERGED, optimum, objective, 0, violation, timings, message)
 
         start = closed_form.within_speed_limits(problem, T) if guess is None else on_grid(problem, guess)
-        barrier = settings.initial_barrier if guess is None else settings.guess_barrier
         deadline = began + settings.time_limit
         # Rows of positions alone are walls, and a guess stands on their right side.
         cautious = guess is not None and not limits.free_at_ends.all()
@@ -140,7 +137,7 @@ class StructuredSolver:
                 message = f"{problem.name}: optimal, limits active at the end only"
                 return Solution(Status.CONVERGED, trajectory, objective, iterations, violation, timings, message)
         x, T = model.map.unknowns(start), start.duration
-        outcome, best, iterations = method.solve(model, x, T, deadline, barrier, cautious)
+        outcome, best, iterations = method.solve(model, x, T, deadline, settings.initial_barrier, cautious)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
