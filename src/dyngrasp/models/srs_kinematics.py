@@ -282,17 +282,17 @@ def _nearest(elbow, rotations, grid, step, branches, reference, weight, middle, 
     """
     q, within = _admissible(elbow, rotations, grid, branches, middle, lower, upper)
     cost = _weighted_squares(q, within, reference, weight)
-    count = grid.size
-    minima = np.full(cost.shape, np.inf)
+    count, columns = branches.shape
+    minima = np.full((count, columns), np.inf)
     for m in range(count):
-        for k in range(cost.shape[1]):
+        for k in range(columns):
             if cost[m, k] <= cost[m - 1, k] and cost[m, k] <= cost[(m + 1) % count, k]:
                 minima[m, k] = cost[m, k]
     best_q, best = np.empty(7), np.inf
     offsets = np.linspace(-1.0, 1.0, 17)
     branch = np.empty((offsets.size, 1), np.int64)
     for flat in np.argsort(minima.ravel())[:_REFINED]:
-        m, k = flat // cost.shape[1], flat % cost.shape[1]
+        m, k = flat // columns, flat % columns
         if not np.isfinite(minima[m, k]):
             break
         width, angle, least, found = step, grid[m], cost[m, k], q[m, k].copy()
