@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dyngrasp.errors import OutOfReach
 from dyngrasp.experiments.draws import draw_trial, trial_seed
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.experiments.trial import execute_trial, plan_trial, planner_for
 from dyngrasp.experiments.workcell import load_workcell
 from dyngrasp.planning.audit import audit
+from dyngrasp.planning.grasp_targets import grasp_targets
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SCENARIO = SCENARIOS / "conveyor_sdh2.toml"
@@ -79,3 +81,19 @@ def test_a_riding_part_is_delivered_with_replanning_and_not_without(planned):
     assert executed.outcome.summary()["undisturbed_mm"] < 3.0
     without = workcell("replanner.enabled=false")
     assert not execute_trial(without, trial, first, planner=planner).outcome.success
+
+
+def test_a_part_that_is_not_yet_in_reach_is_met_where_it_will_be(planned):
+    cell = workcell("part.y_m=-0.6", "conveyor.speed_m_s=0.15", "part.x_m=0.66")
+    trial = draw_trial(cell, SEED)
+    with pytest.raises(OutOfReach):
+        grasp_targets(trial.T_world_object, cell.task, cell.q_start)
+    found = plan_trial(cell, trial, planned[2])
+    assert found.result.ok, found.result.message
+    assert audit(found.result.require(), found.targets, cell.task).ok
+
+
+def test_a_part_that_rides_away_is_out_of_reach(planned):
+    cell = workcell("part.y_m=0.8", "conveyor.speed_m_s=0.2")
+    with pytest.raises(OutOfReach):
+        plan_trial(cell, draw_trial(cell, SEED), planned[2])

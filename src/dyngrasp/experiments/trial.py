@@ -17,6 +17,7 @@ from dyngrasp.closed_loop.pose_source import PoseSource
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.closed_loop.replanning_loop import ReplanEvent
 from dyngrasp.closed_loop.vision_record import VisionRecord
+from dyngrasp.errors import OutOfReach
 from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.metrics import Outcome, judge
 from dyngrasp.experiments.provenance import versions
@@ -25,7 +26,7 @@ from dyngrasp.experiments.vision import camera_poses, films, vision_summary
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved, ranked_grasp_targets
-from dyngrasp.planning.problem import PlanResult
+from dyngrasp.planning.problem import PlanResult, Status
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
 from dyngrasp.simulation.plant import TruthfulPlant
@@ -37,6 +38,9 @@ CANDIDATES = 4
 
 # When a moving part is met, over the time of the grasp of one that stands where it will be met; tried in turn.
 LATER = (1.0, 1.1, 1.25)
+
+# When a moving part may be in reach (s).
+FIRST_GUESSES = (0.0, 2.0, 4.0, 6.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +91,7 @@ def plan_trial(workcell: Workcell, trial: Trial, planner: CollocationPlanner) ->
     attempts = 0
     T, twist = trial.T_world_object_believed, trial.twist_believed
     if twist.any():
-        # When the part is met depends on where, and where on when: this is a first guess.
-        targets = grasp_targets(T, workcell.task, workcell.q_start)
-        first_guess = planner.plan(workcell.q_start, targets)
-        if first_guess.plan is None:
-            return PlannedTrial(targets, first_guess, 1e3 * (time.perf_counter() - began), 1)
-        T = moved(T, twist, float(first_guess.plan.phase_ends[1]))
+        T = moved(T, twist, _first_grasp_time(workcell, trial, planner))
     for targets in islice(ranked_grasp_targets(T, workcell.task, workcell.q_start), CANDIDATES):
         attempts += 1
         result = planner.plan(workcell.q_start, targets)
@@ -106,20 +105,40 @@ def plan_trial(workcell: Workcell, trial: Trial, planner: CollocationPlanner) ->
     return PlannedTrial(*first, 1e3 * (time.perf_counter() - began), attempts)
 
 
+def _first_grasp_time(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> float:
+    """When a moving part is met depends on where, and where on when: how long it takes to where it soon will be (s)."""
+    failure: OutOfReach | None = None
+    for guess in FIRST_GUESSES:
+        T = moved(trial.T_world_object_believed, trial.twist_believed, guess)
+        try:
+            targets = grasp_targets(T, workcell.task, workcell.q_start)
+        except OutOfReach as error:
+            failure = error
+            continue
+        plan = planner.plan(workcell.q_start, targets).plan
+        if plan is not None:
+            return max(guess, float(plan.phase_ends[1]))
+    if failure is not None:
+        raise failure
+    return FIRST_GUESSES[0]
+
+
 def _met(
     workcell: Workcell, trial: Trial, planner: CollocationPlanner, standing: GraspTargets, plan: GraspPlan
 ) -> tuple[GraspTargets, PlanResult]:
     """Targets and plan that meet a moving part, from a plan for one that stands about where it will be met."""
     updater, duration = target_updater(workcell.task), float(plan.durations[1])
-    result = None
+    targets, result = standing, PlanResult(Status.INFEASIBLE, None, (), None, {}, "the part rides out of reach")
     for later in LATER:
         grasp_time = later * float(plan.phase_ends[1])
         T = moved(trial.T_world_object_believed, trial.twist_believed, grasp_time)
-        targets = updater.update(standing, T, trial.twist_believed, grasp_time, duration)
+        try:
+            targets = updater.update(standing, T, trial.twist_believed, grasp_time, duration)
+        except OutOfReach:
+            break
         result = planner.plan(workcell.q_start, targets)
         if result.ok:
             break
-    assert result is not None
     return targets, result
 
 
