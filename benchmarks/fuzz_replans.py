@@ -123,6 +123,8 @@ def main() -> int:
             result = replanner.replan_to_pose(plan, targets, estimate, t)
             done += 1
             outcomes[kind, str(result.path) if result.ok else f"kept: {result.status}"] += 1
+            if done % 1000 == 0:
+                print(f"{done} replans, {len(offending)} offences", flush=True)
             if not result.ok:
                 reasons[_words(result.message)] += 1
                 continue
