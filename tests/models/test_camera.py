@@ -1,11 +1,14 @@
 """The camera's equations against OpenCV and finite differences, and files that are refused."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from dyngrasp.errors import ModelFileError, UnknownName
-from dyngrasp.models.camera import picture_border, read_camera
+from dyngrasp.models.camera import camera_toml, picture_border, read_camera
 from dyngrasp.models.catalogue import CAMERAS, catalogue, check_model, load_camera
 
 
@@ -115,3 +118,26 @@ def test_border_encloses_the_picture(camera):
     border = picture_border(camera)
     assert border.min() == -0.5
     assert border.max() == 1023.5
+
+
+def test_a_camera_that_is_written_is_the_one_that_is_read(camera, tmp_path):
+    random = np.random.default_rng(5)
+    other = replace(
+        camera,
+        name='the "left" one',
+        description="lens of 8 mm\\½",
+        focal=camera.focal + random.normal(0, 10, 2),
+        centre=camera.centre + random.normal(0, 10, 2),
+        distortion=camera.distortion + random.normal(0, 1e-3, 5),
+        T_hand_camera=pin.SE3.Random(),
+    )
+    path = tmp_path / "model.toml"
+    path.write_text(camera_toml(other, ("found today",)), encoding="utf-8")
+    assert path.read_text(encoding="utf-8").startswith("# found today\n")
+    found = read_camera(path)
+    for name in ("name", "description", "width", "height", "rate", "exposure"):
+        assert getattr(found, name) == getattr(other, name)
+    for name in ("focal", "centre", "distortion"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
+    # By way of a quaternion: rounding.
+    np.testing.assert_allclose(found.T_hand_camera.homogeneous, other.T_hand_camera.homogeneous, atol=1e-14)

@@ -141,6 +141,31 @@ def test_too_little_is_refused(true_camera):
         find_board(np.zeros((4, 4, 3), np.uint8), BOARD)
 
 
+def test_a_board_that_is_never_tilted_leaves_the_focal_length_open(true_camera):
+    # Tilts of 0° and 1°: OpenCV answers anything from 1000 to 2300 pixels, and claims to know it to less than one.
+    for spread in (0.0, 0.02):
+        views, _ = views_of(true_camera, 10, seed=3, spread=spread)
+        with pytest.raises(InvalidProblem, match="focal length open"):
+            calibrate_lens(views, BOARD, load_camera("ava1000"))
+
+
+def test_the_deviation_of_the_focal_length_is_that_of_repeated_draws(true_camera):
+    normalised = []
+    for seed in range(40):
+        views, _ = views_of(true_camera, 8, seed=100 + seed)
+        result = calibrate_lens(views, BOARD, load_camera("ava1000"))
+        normalised.append((result.camera.focal[0] - true_camera.focal[0]) / result.focal_deviation[0])
+    # The mean of forty squares has a deviation of 0.22; three of them.
+    assert np.mean(np.square(normalised)) == pytest.approx(1.0, abs=0.67)
+
+
+def test_one_line_of_corners_determines_no_pose():
+    board = Board(columns=12, rows=4)
+    line = BoardView(np.arange(11), np.zeros((11, 2)))
+    assert not line.determines_pose(board)
+    assert BoardView(np.array([*range(10), 14]), np.zeros((11, 2))).determines_pose(board)
+
+
 @pytest.mark.parametrize("change", [{"columns": 2}, {"marker": 0.05}, {"columns": 20, "rows": 20}])
 def test_impossible_boards_are_refused(change):
     with pytest.raises(InvalidProblem):

@@ -7,6 +7,8 @@ x'' = x'(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x'y' + p2(r² + 2x'²), likewise
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -238,6 +240,49 @@ def read_camera(path: str | Path) -> CameraModel:
             path, "intrinsics.distortion", list(intrinsics.distortion), "coefficients that do not fold the picture over"
         )
     return camera
+
+
+def camera_toml(camera: CameraModel, remarks: Sequence[str] = ()) -> str:
+    """The contents of a model.toml that `read_camera` reads to the same numbers, the mount's to rounding.
+
+    Args:
+        camera: What to write.
+        remarks: Lines of a comment at its head.
+    """
+    x, y, z, w = pin.Quaternion(camera.T_hand_camera.rotation).coeffs()
+    # A JSON string is a TOML string.
+    lines = [
+        *(f"# {remark}" for remark in remarks),
+        'kind = "camera"',
+        f"name = {json.dumps(camera.name, ensure_ascii=False)}",
+        f"description = {json.dumps(camera.description, ensure_ascii=False)}",
+        "",
+        "[sensor]",
+        f"width = {camera.width}",
+        f"height = {camera.height}",
+        f"rate_hz = {_number(camera.rate)}",
+        f"exposure_s = {_number(camera.exposure)}",
+        "",
+        "[intrinsics]",
+        *(f"{key} = {_number(value)}" for key, value in zip(("fx", "fy"), camera.focal, strict=True)),
+        *(f"{key} = {_number(value)}" for key, value in zip(("cx", "cy"), camera.centre, strict=True)),
+        "# k1, k2, p1, p2, k3",
+        f"distortion = {_numbers(camera.distortion)}",
+        "",
+        "# The camera frame in the hand frame.",
+        "[mount]",
+        f"position = {_numbers(camera.T_hand_camera.translation)}",
+        f"quat_wxyz = {_numbers((w, x, y, z))}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    return repr(float(value))
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return f"[{', '.join(map(_number, values))}]"
 
 
 def picture_border(camera: CameraModel, step: int = 16) -> Array:
