@@ -146,7 +146,7 @@ def calibrate_lens(views: Sequence[BoardView], board: Board, camera: CameraModel
         camera: Gives the picture's size, and the first guess.
 
     Raises:
-        InvalidProblem: Too few views, views with too few corners, or views so alike that they leave the focal length open.
+        InvalidProblem: Too few views, views with too few corners, or views so alike that the focal length stays open.
     """
     if len(views) < 5:
         raise InvalidProblem(f"a lens needs at least 5 views of the board, got {len(views)}")
