@@ -229,9 +229,12 @@ def _boundaries(
     R, G = models.hand(np.array([*ends, targets.place.position]).T, np.array([*fingers, targets.gripper_closed]).T)
     inside, angles = _seen_from_grasp(R[:2], G[:2], plan.phase_ends[:2], targets)
     above = np.array([0.0, 0.0, task.settings.pregrasp_distance])
+    # A part that is not taken when it was to be rides on.
+    late = max(float(plan.phase_ends[1]) - targets.grasp_time, 0.0) if targets.moving else 0.0
+    rode = late * targets.T_world_grasp.rotation.T @ targets.twist_world[:3]
     errors = (
         ("pregrasp", inside[0] - above, angles[0]),
-        ("grasp", inside[1], angles[1]),
+        ("grasp", inside[1] - rode, angles[1]),
         ("place", G[2] - G[3], _angles(R[2], R[3])),
     )
     entries = []

@@ -281,6 +281,18 @@ def test_moves_late_in_the_approach_are_followed(complete, plan, targets, task, 
         assert result.audit["part_clearance"].ok
 
 
+def test_a_grasp_later_than_the_part_is_met_is_none(complete, plan, targets, task):
+    twist = np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])
+    T = displaced(targets.T_world_object, 0.0, -0.05 * plan.phase_ends[1], 0.0)
+    result = complete.replan_to_pose(plan, targets, estimate(T, 0.1, twist), 0.1)
+    assert result.ok, result.message
+    on_time = audit(result.plan, result.targets, task, result.splice)
+    assert on_time["grasp_position"].ok
+    # 1 ms of waiting is 0.05 mm that the part has ridden on.
+    waiting = replace(result.plan, start_time=result.plan.start_time + 0.001)
+    assert audit(waiting, result.targets, task, result.splice)["grasp_position"].worst == pytest.approx(5e-5, rel=0.05)
+
+
 def test_a_plan_of_another_maker_is_replanned_as_well(local, plan, targets, task):
     """Coarser grids, another for each phase, and rounding of a file: only the plan's own words count."""
     from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, solve_tracking

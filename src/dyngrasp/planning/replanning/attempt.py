@@ -52,10 +52,21 @@ class Attempt:
         if refusal:
             return self._kept(Status.INFEASIBLE, previous, refusal)
         self.previous = previous
-        updater, twist = target_updater(self.task), estimate.twist_world
-        plan, targets = self.plan, previous
+        try:
+            targets = self._targets(previous, estimate)
+        except OutOfReach as error:
+            return self._fresh_or_kept(previous, estimate, f"inverse kinematics: {error}")
+        return self.towards(targets, estimate, previous)
+
+    def _targets(self, previous: GraspTargets, estimate: PoseEstimate, way: int = 0) -> GraspTargets:
+        """Boundary states for an estimate; a moving part is met when one of the descents brings the hand there.
+
+        Raises:
+            OutOfReach: The posture of the running plan cannot follow the part.
+        """
+        updater, twist, plan = target_updater(self.task), estimate.twist_world, self.plan
         moving = self._moves(estimate)
-        grasp_time = float(plan.phase_ends[GRASP])
+        grasp_time, targets = float(plan.phase_ends[GRASP]), previous
         for _ in range(8 if moving else 1):
             started = time.perf_counter()
             T = estimate.T_world_object
@@ -65,20 +76,18 @@ class Attempt:
                 targets = updater.update(
                     previous, T, twist if moving else None, grasp_time, float(plan.durations[GRASP])
                 )
-            except OutOfReach as error:
+            finally:
                 self._count("targets", started)
-                return self._fresh_or_kept(previous, estimate, f"inverse kinematics: {error}")
-            self._count("targets", started)
             if not moving:
                 break
-            candidate = self._track(targets)
+            candidate = self._track(targets, way)
             if candidate.plan is None:
                 break
             change = float(candidate.plan.phase_ends[GRASP]) - grasp_time
             grasp_time, plan = grasp_time + change, candidate.plan
             if abs(change) * float(np.abs(twist).max()) <= self.settings.settled:
                 break
-        return self.towards(targets, estimate, previous)
+        return targets
 
     def towards(
         self, targets: GraspTargets, estimate: PoseEstimate | None = None, previous: GraspTargets | None = None
@@ -97,6 +106,12 @@ class Attempt:
         # In the grasp, and where the paper's program has no way of its own, one way is all there is.
         ways = len(self.settings.tracking.descents) if phase == APPROACH and self.settings.gate else 1
         for way in range(ways):
+            if way and estimate is not None and previous is not None and self._moves(estimate):
+                # Another way takes another time, and then the part is elsewhere.
+                try:
+                    targets = self._targets(previous, estimate, way)
+                except OutOfReach:
+                    break
             candidate = self._track(targets, way)
             self.iterations += candidate.iterations
             status = candidate.status
@@ -295,14 +310,22 @@ class Attempt:
 
     def _published(self, plan: GraspPlan, targets: GraspTargets, path: Path, budget: float) -> ReplanResult:
         """The last look at the clock comes after everything else: what is late is not published."""
-        factor = self.recovery.factor if self.recovery is not None else 1.0
-        self.timings["total"] = 1e3 * (time.perf_counter() - self.began_wall)
+        result = self._result(Status.CONVERGED, plan, path, targets)
         elapsed = self.clock() - self.began
         if elapsed > budget:
             return self._kept(Status.DEADLINE_MISSED, targets, f"{1e3 * elapsed:.1f} ms of {1e3 * budget:.0f} ms taken")
-        message = "; ".join(self.reasons)
+        return result
+
+    def _kept(self, status: Status, targets: GraspTargets, reason: str) -> ReplanResult:
+        if reason:
+            self.reasons.append(reason)
+        return self._result(status, self.plan, Path.KEPT, targets)
+
+    def _result(self, status: Status, plan: GraspPlan, path: Path, targets: GraspTargets) -> ReplanResult:
+        self.timings["total"] = 1e3 * (time.perf_counter() - self.began_wall)
+        factor = self.recovery.factor if self.recovery is not None else 1.0
         return ReplanResult(
-            Status.CONVERGED,
+            status,
             plan,
             path,
             self.splice,
@@ -310,26 +333,7 @@ class Attempt:
             self.report,
             factor,
             self.timings,
-            message,
-            self.iterations,
-        )
-
-    def _kept(self, status: Status, targets: GraspTargets, reason: str) -> ReplanResult:
-        if reason:
-            self.reasons.append(reason)
-        self.timings["total"] = 1e3 * (time.perf_counter() - self.began_wall)
-        factor = self.recovery.factor if self.recovery is not None else 1.0
-        message = "; ".join(self.reasons)
-        return ReplanResult(
-            status,
-            self.plan,
-            Path.KEPT,
-            self.splice,
-            targets,
-            self.report,
-            factor,
-            self.timings,
-            message,
+            "; ".join(self.reasons),
             self.iterations,
         )
 
