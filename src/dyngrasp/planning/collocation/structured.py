@@ -38,6 +38,7 @@ class StructuredSettings:
         max_iterations: Of the interior point method.
         time_limit: Wall time for one phase (s); after it the best iterate is returned.
         initial_barrier: Barrier parameter at the start, relative to the objective.
+        second_barrier: The same for the second attempt that a problem gets which the first does not solve.
         window_barrier: The same where only the end of the motion is sought, under few rows.
     """
 
@@ -46,6 +47,7 @@ class StructuredSettings:
     max_iterations: int = 500
     time_limit: float = 5.0
     initial_barrier: float = 1e-4
+    second_barrier: float = 1e-3
     window_barrier: float = 1e-5
 
 
@@ -57,6 +59,8 @@ _STATUS = {
     Outcome.DEADLINE: Status.DEADLINE_MISSED,
     Outcome.NONFINITE: Status.NONFINITE,
 }
+
+_UNSOLVED = (Outcome.INFEASIBLE, Outcome.ITERATION_LIMIT, Outcome.STALLED)
 
 _WORDS = {
     Outcome.OPTIMAL: "optimal",
@@ -138,6 +142,9 @@ class StructuredSolver:
                 return Solution(Status.CONVERGED, trajectory, objective, iterations, violation, timings, message)
         x, T = model.map.unknowns(start), start.duration
         outcome, best, iterations = method.solve(model, x, T, deadline, settings.initial_barrier, cautious)
+        if outcome in _UNSOLVED:
+            # One in a thousand problems must keep farther from its limits at first; the others are faster so.
+            outcome, best, iterations = method.solve(model, x, T, deadline, settings.second_barrier, cautious)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
