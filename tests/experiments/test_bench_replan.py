@@ -60,7 +60,7 @@ def test_rows_have_the_keys_of_the_interface():
         if row["case"] not in ("end_point_error", "late_moves"):
             assert {"median_ms", "p99_ms", "max_ms", "n"} <= row.keys()
         if row["case"] == "late_moves":
-            assert row["5_mm"] > 0.5
+            assert row["5_mm"] > 0.9
         elif row["solver"] == "replanner":
             assert row["published_invalid"] == 0
             assert row["jumps"] == 0

@@ -212,8 +212,11 @@ def _cycle_rows(cell: Cell, cycles: int, seed: int, progress: Callable[[str], No
 
 
 def late_move_rows(cell: Cell, count: int, seed: int) -> list[dict[str, Any]]:
-    """How many single moves of the part are followed, by what is left of the approach and by the size of the move."""
-    replanner = Replanner(cell.task, None, StructuredSolver(), cell.planner)
+    """How many single moves of the part are followed, by what is left of the approach and by the size of the move.
+
+    Deadlines are not kept here: the shares tell what can be followed, not how fast this machine is.
+    """
+    replanner = Replanner(cell.task, None, StructuredSolver(), cell.planner, lambda: 0.0)
     rng = np.random.default_rng([seed, 2])
     plan, T = cell.plan, cell.targets.T_world_object
     rows: list[dict[str, Any]] = []

@@ -106,19 +106,20 @@ class Attempt:
         # In the grasp, and where the paper's program has no way of its own, one way is all there is.
         ways = len(self.settings.tracking.descents) if phase == APPROACH and self.settings.gate else 1
         for way in range(ways):
+            aimed = targets
             if way and estimate is not None and previous is not None and self._moves(estimate):
                 # Another way takes another time, and then the part is elsewhere.
                 try:
-                    targets = self._targets(previous, estimate, way)
+                    aimed = self._targets(previous, estimate, way)
                 except OutOfReach:
                     break
-            candidate = self._track(targets, way)
+            candidate = self._track(aimed, way)
             self.iterations += candidate.iterations
             status = candidate.status
             if candidate.plan is None:
                 self.reasons.append(f"tracking: {candidate.message}")
                 break
-            best = candidate.plan
+            best, targets = candidate.plan, aimed
             self.report = self._audited(best, targets)
             if self.report.ok or not self.settings.gate:
                 return self._published(best, targets, Path.TRACKING, self.settings.budget)
