@@ -49,7 +49,7 @@ def board_svg(board: Board) -> str:
     width, height = board.columns * board.square + 2 * MARGIN, board.rows * board.square + 2 * MARGIN
     words = (
         f"{board.columns} × {board.rows} squares of {mm * board.square:g} mm, markers of {mm * board.marker:g} mm, "
-        f"{board.dictionary}. Print at 100 %, glue to a flat plate, measure ten squares."
+        f"{board.dictionary}. Printed right, all squares together are {mm * board.columns * board.square:g} mm wide."
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{mm * width:g}mm" height="{mm * height:g}mm" '
