@@ -157,7 +157,6 @@ def test_pictures_are_kept_as_they_were_taken(stage):
         (CameraPosesSettings, {"exposures": 0}),
         (CameraPosesSettings, {"keep_every": -1}),
         (PartTrackerSettings, {"least_markers": 0}),
-        (PartTrackerSettings, {"correlation": 0.5}),
     ],
 )
 def test_impossible_settings_are_refused(kind, settings):

@@ -16,6 +16,7 @@ from dyngrasp.perception.marker_detection import MarkerCorners
 from dyngrasp.perception.marker_pose import MarkerPoseSolver, corners_in_object
 from dyngrasp.perception.part_tracker import Frame, PartTracker, PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilterSettings, PoseUnknown
+from dyngrasp.perception.pose_track import CameraErrors
 from dyngrasp.planning.replanning.replanner import Replanner
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.plant import Truth
@@ -126,13 +127,11 @@ def test_a_replay_gives_the_same_estimates_bit_for_bit(approach, tmp_path):
 
 def test_other_settings_give_other_estimates_of_the_same_frames(approach):
     frames = approach.frames(20)
-    ends = {
-        correlation: RecordedPoses(approach.tracker(correlation=correlation), frames).estimate(None, 0.7)
-        for correlation in (1.0, 8.0)
-    }
-    ratio = ends[8.0].covariance[0, 0] / ends[1.0].covariance[0, 0]
-    # The prior adds next to nothing, so eight times the covariance of every frame is eight times that of their mean.
-    assert ratio == pytest.approx(8.0, rel=0.1)
+    mounts = [CameraErrors(mount=(mount, 0.0)) for mount in (0.0, 2e-3)]
+    trackers = [approach.tracker(filter=replace(PoseFilterSettings.still(), camera=camera)) for camera in mounts]
+    exact, doubtful = (RecordedPoses(tracker, frames).estimate(None, 0.7).covariance for tracker in trackers)
+    # The hand hardly turns: what the mount may be off by, the part may be off by.
+    assert (np.linalg.eigvalsh(doubtful[:3, :3] - exact[:3, :3]) > (1e-3) ** 2).all()
 
 
 def test_without_a_prior_the_first_frames_begin(approach, tmp_path):
@@ -227,9 +226,9 @@ class TestNothingIsSeen:
         assert lost == [t for t in asked if lost[0] <= t < in_hand]
         assert len(lost) >= 4
         assert {event.result.message for event in loop.events if event.t >= in_hand} == {"the part is in the hand"}
-        # White acceleration of density 0.2 m/s²/√Hz: 5 mm after (3·(0.005/0.2)²)^⅓ = 0.12 s if pose and velocity were
-        # known exactly; they are not.
-        assert lost[0] <= self.BLIND + 0.22
+        # White acceleration of density 0.05 m/s²/√Hz: 5 mm after (3·(0.005/0.05)²)^⅓ = 0.31 s if pose and velocity were
+        # known exactly; they are not, and turns of the part move the grasp point too.
+        assert lost[0] <= self.BLIND + 0.35
 
     def test_a_part_that_lies_still_stays_known(self, planned, approach):
         loop, _ = self.loop(planned, approach, 0.005)

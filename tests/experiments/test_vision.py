@@ -31,7 +31,7 @@ def test_the_part_s_motion_is_the_filter_s():
     velocity = tracker_settings(moving).filter.motion.first_velocity
     # A belt of 0.1 m/s must lie well within what is held possible.
     assert velocity[0] > 0.2
-    assert tracker_settings(moving).filter.shared_error == tracker_settings(still).filter.shared_error
+    assert tracker_settings(moving).filter.camera == tracker_settings(still).filter.camera
 
 
 def truth(cell, trial, twist):

@@ -95,12 +95,15 @@ def test_a_correction_is_bayes_rule():
     measured = s.T_world_object * pin.exp6(np.array([1, -2, 0.5, 2, 1, -1]) * 1e-5)
     R = np.diag(np.repeat([5e-4, 1e-3], 3) ** 2)
     corrected = correct(s, PoseEstimate(measured, R, 0.5, 0.5))
+    # The error of the measurement is one of T_measured, the difference one of T: they differ by the logarithm's slope.
+    slope = pin.Jlog6(s.T_world_object.actInv(measured))
     information = np.linalg.inv(s.covariance)
-    information[:6, :6] += np.linalg.inv(R)
+    information[:6, :6] += np.linalg.inv(slope @ R @ slope.T)
     expected = np.linalg.inv(information)
     np.testing.assert_allclose(corrected.covariance, expected, rtol=1e-3, atol=1e-10)
     r, S, distance = innovation(s, PoseEstimate(measured, R, 0.5, 0.5))
-    np.testing.assert_allclose(difference(corrected, s), expected[:, :6] @ np.linalg.solve(R, r), rtol=1e-3, atol=1e-10)
+    moved = expected[:, :6] @ np.linalg.solve(slope @ R @ slope.T, r)
+    np.testing.assert_allclose(difference(corrected, s), moved, rtol=1e-3, atol=1e-10)
     assert distance == pytest.approx(r @ np.linalg.inv(S) @ r)
 
 

@@ -105,8 +105,7 @@ def test_markers_are_where_the_camera_model_says(sensor, camera, casting, state,
 
 def test_the_filter_finds_a_part_at_rest_from_a_moving_hand(sensor, camera, casting, state, put, marked):
     detector, solver = MarkerDetector(casting), MarkerPoseSolver(camera, casting)
-    # Errors that all frames share (0.1 mm, 0.05°) come from the picture's grid and are no noise.
-    pose_filter = PoseFilter(replace(PoseFilterSettings.still(), shared_error=(2e-4, 2e-3)))
+    pose_filter = PoseFilter(PoseFilterSettings.still())
     T_true = sensor.pose(state) * before_camera(0.5, tilt=0.1, yaw=0.4)
     verdicts = []
     for k in range(15):

@@ -14,7 +14,6 @@ from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.catalogue import load_camera, load_gripper, load_object, load_robot
 from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
-from dyngrasp.perception.part_tracker import PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilter, PoseFilterSettings
 from dyngrasp.signals import Array
 from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
@@ -31,9 +30,6 @@ DRIFT = np.deg2rad(4.0)
 ASIDE, TILT = 0.02, 0.5
 
 FRAMES = 12
-
-# What frames share: the grid of pixels. Position (m) and rotation (rad), see `PoseFilterSettings`.
-SHARED = (2e-4, 2e-3)
 
 
 def bench_perception(
@@ -65,8 +61,7 @@ def bench_perception(
     scene = build_scene(robot, gripper, part, markers=True)
     detector, solver = MarkerDetector(part), MarkerPoseSolver(camera, part)
     resting = MujocoPlant(scene, POSTURE, gripper.open_posture, pin.SE3.Identity()).state
-    settings = replace(PoseFilterSettings.still(), acquire_frames=3, shared_error=SHARED)
-    correlation = PartTrackerSettings().correlation
+    settings = replace(PoseFilterSettings.still(), acquire_frames=3)
     rng = np.random.default_rng(seed)
     times: dict[str, list[float]] = {"detect": [], "pose": [], "filter": [], "frame": []}
     rows = []
@@ -93,10 +88,7 @@ def bench_perception(
                     detected = time.perf_counter()
                     sighting = solver.solve(found)
                     solved = time.perf_counter()
-                    candidates = [
-                        replace(c, covariance=correlation * c.covariance).in_world(T_world_camera, t, t)
-                        for c in sighting.plausible
-                    ]
+                    candidates = [c.in_world(T_world_camera, t, t) for c in sighting.plausible]
                     if candidates:
                         pose_filter.update(candidates)
                     done = time.perf_counter()

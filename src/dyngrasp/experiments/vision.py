@@ -22,6 +22,7 @@ from dyngrasp.perception.marker_detection import MarkerDetector
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
 from dyngrasp.perception.part_tracker import PartTracker, PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilterSettings
+from dyngrasp.perception.pose_track import CameraErrors
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
 from dyngrasp.simulation.scene import Scene
@@ -33,9 +34,6 @@ _IMAGE_STREAM = 8
 # After the planned grasp by so much (s) no more pictures are taken: a replanned grasp may come a little later, and once
 # the fingers hold the part nobody asks where it is.
 _AFTER_GRASP = 0.5
-
-# From which the part is seen on the way to it (m).
-_VIEWING_DISTANCE = 0.4
 
 
 def films(workcell: Workcell) -> bool:
@@ -93,11 +91,9 @@ def tracker_settings(scenario: Scenario) -> PartTrackerSettings:
     """How the part is followed: what the scenario says of its motion and of the calibration."""
     section = scenario.camera
     pose_filter = PoseFilterSettings.still() if scenario.pose.motion == "still" else PoseFilterSettings()
-    # What every frame has in common: the mount's error, seen from the distance at which the part is approached, and a
-    # floor for the grid of pixels. A calibration knows how large the former is.
-    turn = np.deg2rad(section.mount_deg)
-    shared = (np.hypot(1e-3 * section.mount_mm, turn * _VIEWING_DISTANCE) + 2e-4, turn + np.deg2rad(0.05))
-    return PartTrackerSettings(filter=replace(pose_filter, shared_error=(float(shared[0]), float(shared[1]))))
+    # The mount is wrong by so much in a random direction: a third of the square along each axis.
+    mount = np.array([1e-3 * section.mount_mm, np.deg2rad(section.mount_deg)]) / np.sqrt(3)
+    return PartTrackerSettings(filter=replace(pose_filter, camera=CameraErrors((float(mount[0]), float(mount[1])))))
 
 
 def recorded_poses(

@@ -19,7 +19,8 @@ from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.grasp_object import GraspObject, Marker
 from dyngrasp.perception.marker_detection import MarkerCorners
-from dyngrasp.signals import Array, PoseEstimate, read_only
+from dyngrasp.perception.pose_track import CameraPose
+from dyngrasp.signals import Array, read_only
 
 # Corners of a marker of size 1 in its frame (x right, y up, z towards the viewer), in the order of `MarkerCorners`.
 UNIT_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
@@ -75,8 +76,8 @@ class PoseCandidate:
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", read_only(self.covariance, (6, 6)))
 
-    def in_world(self, T_world_camera: pin.SE3, t_capture: float, t_receipt: float) -> PoseEstimate:
-        """The same as an estimate in the world.
+    def in_world(self, T_world_camera: pin.SE3, t_capture: float, t_receipt: float) -> CameraPose:
+        """The same as a measurement in the world.
 
         Args:
             T_world_camera: Where the camera was at the capture, not now.
@@ -84,7 +85,8 @@ class PoseCandidate:
             t_receipt: When the picture had been worked out (s).
         """
         # A right perturbation acts in the object's frame: the camera's pose does not turn it.
-        return PoseEstimate(T_world_camera * self.T_camera_object, self.covariance, t_capture, t_receipt)
+        T = T_world_camera * self.T_camera_object
+        return CameraPose(T, self.covariance, t_capture, t_receipt, T_camera_object=self.T_camera_object)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ are worked out by the same lines and give the same numbers.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
@@ -29,21 +29,16 @@ class PartTrackerSettings:
         least_markers: Poses that so many markers agree with always reach the filter. Fewer do if they are not ambiguous
             and `largest_tilt` holds: one small square far away gives its tilt by a few pixels, wrong for many frames.
         largest_tilt: Standard deviation of the rotation that is small enough for that (rad).
-        correlation: By how much covariances of single frames are enlarged: so many count as one. The error of a corner
-            depends on where it lies on the grid of pixels and repeats while the view changes little.
         filter: Of the pose filter.
     """
 
     least_markers: int = 2
     largest_tilt: float = np.deg2rad(1.0)
-    correlation: float = 8.0
     filter: PoseFilterSettings = field(default_factory=PoseFilterSettings.still)
 
     def __post_init__(self) -> None:
-        if self.least_markers < 1 or not (np.isfinite(self.correlation) and self.correlation >= 1):
-            raise InvalidProblem(
-                f"least_markers ≥ 1 and correlation ≥ 1 expected, got {self.least_markers}, {self.correlation}"
-            )
+        if self.least_markers < 1:
+            raise InvalidProblem(f"least_markers ≥ 1 expected, got {self.least_markers}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +133,7 @@ class PartTracker:
         T_world_hand: pin.SE3 = self.robot.forward_kinematics(frame.arm_position) * self.gripper.T_flange_hand
         T_world_camera = T_world_hand * self.solver.camera.T_hand_camera
         candidates = [
-            replace(c, covariance=self.settings.correlation * c.covariance).in_world(
-                T_world_camera, frame.t_capture, frame.t_receipt
-            )
+            c.in_world(T_world_camera, frame.t_capture, frame.t_receipt)
             for c in sighting.plausible
             if self._passes(c, sighting)
         ]

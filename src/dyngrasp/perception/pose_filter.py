@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from dyngrasp.errors import DyngraspError, InvalidProblem
-from dyngrasp.perception.pose_track import MotionSettings, TrackState, begin, correct, innovation, predict
+from dyngrasp.perception.pose_track import CameraErrors, MotionSettings, TrackState, begin, correct, innovation, predict
 from dyngrasp.signals import PoseEstimate
 
 # Captures closer than this are one capture (s): the camera's fastest frames are 10 ms apart.
@@ -61,8 +61,7 @@ class PoseFilterSettings:
         longest_gap: Without measurements for longer than this (s) the track is lost: it still predicts, but only a new
             row of frames that agree brings it back.
         clock_tolerance: How far a capture may lie ahead of now (s): rounding, not another clock.
-        shared_error: Standard deviation per axis (m, rad) of what all frames have in common, such as an error of the
-            calibration: added to what is reported; averaging frames does not reduce it.
+        camera: What the poses of a camera have in common, which averaging frames does not reduce.
     """
 
     motion: MotionSettings = field(default_factory=MotionSettings)
@@ -71,7 +70,7 @@ class PoseFilterSettings:
     history: float = 0.5
     longest_gap: float = 2.0
     clock_tolerance: float = 1e-4
-    shared_error: tuple[float, float] = (0.0, 0.0)
+    camera: CameraErrors = field(default_factory=CameraErrors)
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.gate < 1.0:
@@ -81,8 +80,6 @@ class PoseFilterSettings:
         for name in ("history", "longest_gap", "clock_tolerance"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise InvalidProblem(f"{name} must be ≥ 0 s, got {getattr(self, name)}")
-        if len(self.shared_error) != 2 or not (np.isfinite(self.shared_error).all() and min(self.shared_error) >= 0):
-            raise InvalidProblem(f"shared_error: two numbers ≥ 0 expected, got {self.shared_error}")
 
     @classmethod
     def still(cls) -> PoseFilterSettings:
@@ -106,7 +103,7 @@ class _Track:
 
     def __init__(self, first: PoseEstimate, settings: PoseFilterSettings, limit: float) -> None:
         self._settings, self._limit = settings, limit
-        self._steps = [_Step(begin(first, settings.motion), (first,))]
+        self._steps = [_Step(begin(first, settings.motion, settings.camera), (first,))]
         self.frames, self.total_surprise = 1, 0.0
 
     @property
@@ -125,7 +122,7 @@ class _Track:
     def surprise(self, candidates: Candidates) -> float:
         """Twice the negative log likelihood of the candidate that fits best, less a constant; infinite off the gate."""
         predicted = self.at(candidates[0].t_capture)
-        best, distance = nearest(predicted, candidates)
+        best, distance = nearest(predicted, candidates, self._settings.camera)
         if not distance <= self._limit:
             return np.inf
         return distance + _spread(predicted, best)
@@ -134,17 +131,18 @@ class _Track:
         """Take in the candidate that fits best if it passes the gate."""
         t = candidates[0].t_capture
         predicted = self.at(t)
-        best, distance = nearest(predicted, candidates)
+        best, distance = nearest(predicted, candidates, self._settings.camera)
         if not distance <= self._limit:
             return False
         place = bisect_right(self._steps, t, key=lambda step: step.state.t)
         self.total_surprise += distance + _spread(predicted, best)
-        state = correct(predicted, best)
+        state = correct(predicted, best, self._settings.camera)
         later = self._steps[place:]
         self._steps[place:] = [_Step(state, candidates)]
         for step in later:
             state = predict(state, step.state.t, self._settings.motion)
-            state = correct(state, nearest(state, step.candidates)[0])
+            best, _ = nearest(state, step.candidates, self._settings.camera)
+            state = correct(state, best, self._settings.camera)
             self._steps.append(_Step(state, step.candidates))
         self.frames += 1
         self._forget()
@@ -223,12 +221,10 @@ class PoseFilter:
             PoseUnknown: Nothing has been acquired yet, or t lies before what the history knows.
         """
         state = self.state(t)
-        shared = np.diag(np.repeat(self.settings.shared_error, 3) ** 2)
-        covariance = state.covariance[:6, :6] + shared
-        return PoseEstimate(state.T_world_object, covariance, t, t, state.twist_world)
+        return PoseEstimate(state.T_world_object, state.covariance[:6, :6], t, t, state.twist_world)
 
     def state(self, t: float) -> TrackState:
-        """Pose, twist and their covariance (12, 12) at time t (s), without the shared error; errors as `estimate`."""
+        """Pose, twist and their covariance at time t (s); raises as `estimate` does."""
         if self._track is None:
             raise PoseUnknown(f"no pose yet: {self.settings.acquire_frames} frames that agree are needed")
         if not np.isfinite(t) or t < self._track.oldest - SAME_TIME:
@@ -282,9 +278,9 @@ def _spread(state: TrackState, estimate: PoseEstimate) -> float:
     return float(np.linalg.slogdet(state.covariance[:6, :6] + estimate.covariance)[1])
 
 
-def nearest(state: TrackState, candidates: Candidates) -> tuple[PoseEstimate, float]:
+def nearest(state: TrackState, candidates: Candidates, camera: CameraErrors) -> tuple[PoseEstimate, float]:
     """The candidate that a track explains best, and its squared Mahalanobis distance."""
-    distances = [innovation(state, candidate)[2] for candidate in candidates]
+    distances = [innovation(state, candidate, camera)[2] for candidate in candidates]
     best = int(np.argmin(distances))
     return candidates[best], distances[best]
 
