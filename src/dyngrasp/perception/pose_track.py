@@ -214,8 +214,8 @@ def _observed(
         state = _in_view_of(state, estimate, camera)
         white, G = _split(estimate, camera)
     difference = state.T_world_object.actInv(estimate.T_world_object)
-    # log(exp(x)·exp(e)) = x + J e with x near r. A first look may differ by centimetres from what was believed: with the
-    # identity for J, what is well known of a pose would be mixed with what is not.
+    # log(exp(x)·exp(e)) = x + J e with x near r. A first look may differ by centimetres from what was believed: were J
+    # left out, what is well known of a pose would be mixed with what is not.
     J = pin.Jlog6(difference)
     r = pin.log6(difference).vector - J @ G @ state.errors
     return state, r, np.hstack([np.eye(6, 12), J @ G]), J @ white @ J.T
