@@ -8,7 +8,7 @@ x'' = x'(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x'y' + p2(r² + 2x'²), likewise
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -243,46 +243,43 @@ def read_camera(path: str | Path) -> CameraModel:
 
 
 def camera_toml(camera: CameraModel, remarks: Sequence[str] = ()) -> str:
-    """The contents of a model.toml that `read_camera` reads to the same numbers, the mount's to rounding.
+    """The contents of a model.toml from which `read_camera` gives the same camera, numbers to the last bit, the mount to rounding.
 
     Args:
         camera: What to write.
-        remarks: Lines of a comment at its head.
+        remarks: Lines for people, written as comments.
     """
     x, y, z, w = pin.Quaternion(camera.T_hand_camera.rotation).coeffs()
-    # A JSON string is a TOML string.
     lines = [
-        *(f"# {remark}" for remark in remarks),
+        *(f"# {' '.join(remark.split())}" for remark in remarks),
         'kind = "camera"',
-        f"name = {json.dumps(camera.name, ensure_ascii=False)}",
-        f"description = {json.dumps(camera.description, ensure_ascii=False)}",
+        f"name = {_quoted(camera.name)}",
+        f"description = {_quoted(camera.description)}",
         "",
         "[sensor]",
         f"width = {camera.width}",
         f"height = {camera.height}",
-        f"rate_hz = {_number(camera.rate)}",
-        f"exposure_s = {_number(camera.exposure)}",
+        f"rate_hz = {float(camera.rate)!r}",
+        f"exposure_s = {float(camera.exposure)!r}",
         "",
+        "# Pixels, counted from the centre of the upper left one.",
         "[intrinsics]",
-        *(f"{key} = {_number(value)}" for key, value in zip(("fx", "fy"), camera.focal, strict=True)),
-        *(f"{key} = {_number(value)}" for key, value in zip(("cx", "cy"), camera.centre, strict=True)),
-        "# k1, k2, p1, p2, k3",
-        f"distortion = {_numbers(camera.distortion)}",
+        *(f"{key} = {float(value)!r}" for key, value in zip(("fx", "fy"), camera.focal, strict=True)),
+        *(f"{key} = {float(value)!r}" for key, value in zip(("cx", "cy"), camera.centre, strict=True)),
+        "# k1, k2, p1, p2, k3 of OpenCV's model.",
+        f"distortion = {camera.distortion.tolist()}",
         "",
-        "# The camera frame in the hand frame.",
+        "# Camera frame (z along the view, x to the right and y downwards in the picture) in the hand frame.",
         "[mount]",
-        f"position = {_numbers(camera.T_hand_camera.translation)}",
-        f"quat_wxyz = {_numbers((w, x, y, z))}",
+        f"position = {camera.T_hand_camera.translation.tolist()}",
+        f"quat_wxyz = {[float(value) for value in (w, x, y, z)]}",
     ]
     return "\n".join(lines) + "\n"
 
 
-def _number(value: float) -> str:
-    return repr(float(value))
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return f"[{', '.join(map(_number, values))}]"
+def _quoted(text: str) -> str:
+    # JSON's strings are TOML's, but for DEL, which TOML wants escaped.
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def picture_border(camera: CameraModel, step: int = 16) -> Array:
