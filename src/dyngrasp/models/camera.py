@@ -243,7 +243,7 @@ def read_camera(path: str | Path) -> CameraModel:
 
 
 def camera_toml(camera: CameraModel, remarks: Sequence[str] = ()) -> str:
-    """The contents of a model.toml from which `read_camera` gives the same camera, numbers to the last bit, the mount to rounding.
+    """The contents of a model.toml that `read_camera` reads again: numbers to the last bit, the mount to rounding.
 
     Args:
         camera: What to write.
