@@ -148,6 +148,26 @@ def test_a_number_seen_twice_is_no_marker(detector, draw):
     assert detector.detect(twice) == ()
 
 
+def test_a_search_at_half_the_size_finds_the_same_corners(casting, camera, draw, detector):
+    half = MarkerDetector(casting, DetectionSettings(search_side=320))
+    errors: list[list[np.ndarray]] = [[], []]
+    for T in views(12, seed=5):
+        T = pin.SE3(T.rotation, T.translation * 0.3 / T.translation[2])
+        picture = draw(T)
+        for side, found in zip(errors, (half.detect(picture), detector.detect(picture)), strict=True):
+            truth = exact(camera, casting, T, range(5))
+            side.append(np.full((5, 4), np.nan))
+            for marker in found:
+                side[-1][marker.id] = np.linalg.norm(marker.corners - truth[marker.id].corners, axis=1)
+    halved, whole = np.array(errors)
+    both = np.isfinite(halved) & np.isfinite(whole)
+    # A marker seen from the side may be too narrow for the smaller picture.
+    assert both.sum() > 0.95 * np.isfinite(whole).sum() > 60
+    # What is found is where the refinement ends, but for single corners of such markers.
+    assert np.mean(np.abs(halved - whole)[both] > 0.02) < 0.1
+    assert np.sqrt(np.mean(halved[both] ** 2)) < 1.1 * np.sqrt(np.mean(whole[both] ** 2))
+
+
 def test_colour_pictures_are_read_as_grey(detector, draw):
     picture = draw(looking_down(0.45, tilt=0.2))
     grey, colour = detector.detect(picture), detector.detect(np.repeat(picture[..., None], 3, axis=2))
@@ -178,7 +198,7 @@ def test_impossible_settings_of_the_solver_are_refused(settings):
         MarkerPoseSettings(**settings)
 
 
-@pytest.mark.parametrize("settings", [{"threshold_windows": (1, 5, 2)}, {"smallest_share": 0.0}])
+@pytest.mark.parametrize("settings", [{"threshold_windows": (1, 5, 2)}, {"smallest_share": 0.0}, {"search_side": 0}])
 def test_impossible_settings_of_the_detector_are_refused(settings):
     with pytest.raises(InvalidProblem):
         DetectionSettings(**settings)

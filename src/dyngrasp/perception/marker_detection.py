@@ -1,4 +1,8 @@
-"""Where the corners of a part's markers are in a picture, to a fraction of a pixel."""
+"""Where the corners of a part's markers are in a picture, to a fraction of a pixel.
+
+Large pictures are searched at a reduced size, which takes a quarter of the time at half the size and finds the same
+markers; corners are then refined in the picture itself, so that nothing is lost of their accuracy.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +16,25 @@ from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.grasp_object import MARKER_DICTIONARIES, GraspObject
 from dyngrasp.signals import Array, read_only
 
+# A refined corner has come to rest within this (pixels), or is as good as it gets after so many steps.
+_REFINED = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.005)
+
 
 @dataclass(frozen=True)
 class DetectionSettings:
     """Settings of `MarkerDetector`.
 
     Attributes:
-        threshold_windows: Smallest, largest size and step of the adaptive threshold's window (pixels); each one costs a
-            pass over the picture.
+        search_side: A picture whose longer side holds this n times is searched at an nth of its size (pixels).
+        threshold_windows: Smallest, largest size and step of the adaptive threshold's window (pixels of the picture as
+            it is searched); each one costs a pass over it.
         smallest_share: Least perimeter of a marker as a share of the picture's longer side.
         refinement_window: Half size of the window in which a corner is refined (pixels), at most.
         refinement_share: The same as a share of the marker's module, which holds for small markers.
     """
 
-    threshold_windows: tuple[int, int, int] = (13, 33, 20)
+    search_side: int = 512
+    threshold_windows: tuple[int, int, int] = (7, 17, 10)
     smallest_share: float = 0.06
     refinement_window: int = 5
     refinement_share: float = 0.4
@@ -36,6 +45,8 @@ class DetectionSettings:
             raise InvalidProblem(
                 f"threshold_windows: 3 ≤ smallest ≤ largest and step ≥ 1, got {self.threshold_windows}"
             )
+        if self.search_side < 16:
+            raise InvalidProblem(f"search_side: at least 16 pixels expected, got {self.search_side}")
         if not 0.0 < self.smallest_share < 1.0 or self.refinement_window < 1 or not 0.0 < self.refinement_share <= 1.0:
             raise InvalidProblem(
                 f"shares within (0, 1] and a window of at least 1 pixel expected, got {self.smallest_share}, "
@@ -90,11 +101,11 @@ class MarkerDetector:
         parameters.adaptiveThreshWinSizeMax = high
         parameters.adaptiveThreshWinSizeStep = step
         parameters.minMarkerPerimeterRate = self.settings.smallest_share
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        parameters.cornerRefinementWinSize = self.settings.refinement_window
-        parameters.relativeCornerRefinmentWinSize = self.settings.refinement_share
-        parameters.cornerRefinementMaxIterations = 30
-        parameters.cornerRefinementMinAccuracy = 0.005
+        # Lines through the sides begin the refinement within a pixel: from the polygon's corners, two pixels of the
+        # picture away where it is searched at half its size, a small marker's may end on the wrong edge.
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        # Of a marker's side, the black border included.
+        self._modules = dictionary.markerSize + 2
         self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 
     def detect(self, image: NDArray[np.uint8]) -> tuple[MarkerCorners, ...]:
@@ -111,16 +122,23 @@ class MarkerDetector:
         image = np.asarray(image)
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
             raise InvalidProblem(f"a picture of uint8, (h, w) or (h, w, 3), expected; got {image.dtype} {image.shape}")
-        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        corners, ids, _ = self._detector.detectMarkers(grey)
+        grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+        factor = max(1, max(grey.shape) // self.settings.search_side)
+        # Without a change of size this is a copy.
+        searched = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+        squares, ids, _ = self._detector.detectMarkers(searched)
         numbers = [] if ids is None else [int(number) for number in np.ravel(ids)]
-        return tuple(
-            sorted(
-                (
-                    MarkerCorners(number, np.asarray(found, dtype=float).reshape(4, 2))
-                    for number, found in zip(numbers, corners, strict=True)
-                    if number in self._ids and numbers.count(number) == 1
-                ),
-                key=lambda marker: marker.id,
-            )
+        found = ((n, s) for n, s in zip(numbers, squares, strict=True) if n in self._ids and numbers.count(n) == 1)
+        # Whole numbers are centres of pixels: edges of the picture, half a pixel away, are what scales.
+        markers = (
+            MarkerCorners(n, self._refine(grey, (s.reshape(4, 2).astype(float) + 0.5) * factor - 0.5)) for n, s in found
         )
+        return tuple(sorted(markers, key=lambda marker: marker.id))
+
+    def _refine(self, grey: NDArray[np.uint8], square: Array) -> Array:
+        """(4, 2) corners where the grey values say they are, from a square that is about right."""
+        s = self.settings
+        side = float(np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1).mean())
+        window = int(np.clip(round(s.refinement_share * side / self._modules), 1, s.refinement_window))
+        corners = np.array(square, dtype=np.float32, order="C")
+        return cv2.cornerSubPix(grey, corners, (window, window), (-1, -1), _REFINED).astype(float)
