@@ -12,11 +12,15 @@ from dyngrasp.perception.calibration import Board, find_board
 SCALE = 4  # pixels a millimetre
 
 
+def between(before, after, svg):
+    return svg.split(before, 1)[1].split(after, 1)[0]
+
+
 def painted(svg):
     """The rectangles of the drawing's path, painted; the path holds nothing else."""
-    left, top, width, height = map(float, re.search(r'viewBox="([^"]+)"', svg)[1].split())
+    left, top, width, height = map(float, between('viewBox="', '"', svg).split())
     picture = np.full((round(SCALE * height), round(SCALE * width)), 255, np.uint8)
-    path = re.search(r'<path d="([^"]+)"', svg)[1]
+    path = between('<path d="', '"', svg)
     squares = re.findall(r"M(\S+) (\S+?)h(\S+?)v(\S+?)h-(\S+?)z", path)
     assert len(squares) == path.count("M")
     for square in squares:
@@ -38,7 +42,7 @@ def test_the_printed_board_is_the_rendered_one(board):
     assert np.mean(on_paper != drawn) < 0.02
     unlike = cv2.morphologyEx((on_paper != drawn).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     assert not unlike.any()
-    width = float(re.search(r'width="([\d.]+)mm"', svg)[1])
+    width = float(between('width="', "mm", svg))
     assert width == pytest.approx(1e3 * (board.columns * board.square + 2 * MARGIN))
     # And it is what the detector knows: corners where the squares meet.
     view = find_board(on_paper, board)

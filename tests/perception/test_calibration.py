@@ -162,8 +162,8 @@ def test_the_deviation_of_the_focal_length_is_that_of_repeated_draws(true_camera
 def test_one_line_of_corners_determines_no_pose():
     board = Board(columns=12, rows=4)
     line = BoardView(np.arange(11), np.zeros((11, 2)))
-    assert not line.determines_pose(board)
-    assert BoardView(np.array([*range(10), 14]), np.zeros((11, 2))).determines_pose(board)
+    assert line.shortcoming(board)
+    assert BoardView(np.array([*range(10), 14]), np.zeros((11, 2))).shortcoming(board) is None
 
 
 @pytest.mark.parametrize("change", [{"columns": 2}, {"marker": 0.05}, {"columns": 20, "rows": 20}])

@@ -1,4 +1,4 @@
-"""The command line: `dyngrasp run | plan | study | perceive | bench | models | check`."""
+"""The command line: `dyngrasp run | plan | study | perceive | calibrate | bench | models | check`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ COMMANDS = {
     "plan": ("dyngrasp.cli.run", "plan"),
     "study": ("dyngrasp.cli.study", "study"),
     "perceive": ("dyngrasp.cli.perceive", "perceive_folder"),
+    "calibrate": ("dyngrasp.cli.calibrate", "calibrate"),
     "bench": ("dyngrasp.cli.bench", "bench"),
     "models": ("dyngrasp.cli.inspect", "models"),
     "check": ("dyngrasp.cli.inspect", "check"),

@@ -25,6 +25,7 @@ _POSES = {
         *(f"pose.{key}=0" for key in ("position_mm", "rotation_deg", "along_mm", "across_mm", "up_mm")),
     ),
 }
+_DICTIONARIES = ("4x4_50", "5x5_50", "6x6_50", "apriltag_36h11")
 _SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"
 
 
@@ -94,6 +95,8 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     perceive.add_argument("--out", metavar="FILE", default="poses.csv", help="where the poses go; default: poses.csv")
     perceive.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides", help=_SET)
 
+    _add_calibrate(commands)
+
     bench = commands.add_parser("bench", help="measure how long planning takes")
     benchmarks = bench.add_subparsers(dest="benchmark", required=True, metavar="WHAT")
     bench_plan = benchmarks.add_parser("plan", help="whole plans and their phases, against other solvers")
@@ -127,6 +130,68 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _add_calibrate(commands: Any) -> None:
+    board = argparse.ArgumentParser(add_help=False)
+    geometry = board.add_argument_group("board (ChArUco)")
+    geometry.add_argument(
+        "--columns", type=_count, metavar="N", default=8, help="squares from left to right; default: 8"
+    )
+    geometry.add_argument("--rows", type=_count, metavar="N", default=6, help="squares from top to bottom; default: 6")
+    geometry.add_argument(
+        "--square-mm", type=_millimetres, metavar="MM", dest="square", default=0.030,
+        help="edge of a square, as measured; default: 30",
+    )  # fmt: skip
+    geometry.add_argument(
+        "--marker-mm", type=_millimetres, metavar="MM", dest="marker", default=0.022,
+        help="edge of a marker; default: 22",
+    )  # fmt: skip
+    geometry.add_argument(
+        "--dictionary", choices=_DICTIONARIES, default="5x5_50", help="family of the markers; default: 5x5_50"
+    )
+    start = "camera file or name to begin with: size of the pictures, rough focal lengths; default: ava1000"
+    size: dict[str, Any] = {
+        "type": _pixels,
+        "nargs": 2,
+        "metavar": ("WIDTH", "HEIGHT"),
+        "help": "of the pictures, if not the camera file's",
+    }
+    out = "the camera file to write; there must be none of that name yet"
+    against = "a camera file to compare with, e.g. of the last calibration"
+
+    calibrate = commands.add_parser("calibrate", help="find the camera's lens and its place on the hand")
+    things = calibrate.add_subparsers(dest="what", required=True, metavar="WHAT")
+    lens = things.add_parser("camera", parents=[board], help="the lens, from a folder of pictures of the board")
+    lens.add_argument("folder", metavar="FOLDER", help="PNG or JPEG pictures of the board, at least 5, better 20")
+    lens.add_argument("--camera", metavar="FILE", default="ava1000", help=start)
+    lens.add_argument("--size", **size)
+    lens.add_argument("--out", metavar="FILE", required=True, help=out)
+    lens.add_argument("--against", metavar="FILE", help=against)
+    mount = things.add_parser("handeye", parents=[board], help="the mount, from pictures and the arm's postures")
+    mount.add_argument(
+        "folder",
+        metavar="FOLDER",
+        help="pictures, and frames.csv with columns picture and NAME_rad or NAME_deg a joint",
+    )
+    mount.add_argument("--camera", metavar="FILE", required=True, help="camera file with the calibrated lens")
+    mount.add_argument("--robot", metavar="NAME", default="iiwa14", help="name or model.toml; default: iiwa14")
+    mount.add_argument("--gripper", metavar="NAME", default="sdh2", help="name or model.toml; default: sdh2")
+    mount.add_argument("--out", metavar="FILE", required=True, help=out)
+    mount.add_argument("--against", metavar="FILE", help=against)
+    drawn = things.add_parser("board", parents=[board], help="the board as a drawing to print")
+    drawn.add_argument("--out", metavar="FILE", default="board.svg", help="a new SVG file; default: board.svg")
+    film = things.add_parser("render", parents=[board], help="pictures of a board in the simulated cell, to try it on")
+    film.add_argument("folder", metavar="FOLDER", help="for pictures, frames.csv and truth.toml; new or empty")
+    film.add_argument("--views", type=_count, metavar="N", default=30, help="number of pictures; default: 30")
+    film.add_argument("--seed", type=_seed, metavar="S", default=0, help="draws views, noise and camera; default: 0")
+    film.add_argument(
+        "--camera", metavar="FILE", default="ava1000", help="the camera as its file has it; default: ava1000"
+    )
+    film.add_argument("--size", **size)
+    film.add_argument(
+        "--noise", type=_weight, metavar="G", default=1.5, help="of the pictures (grey values of 255); default: 1.5"
+    )
+
+
 def _seed(text: str) -> int:
     value = int(text)
     if not 0 <= value < 2**63:
@@ -141,6 +206,20 @@ def _count(text: str) -> int:
     return value
 
 
+def _millimetres(text: str) -> float:
+    value = float(text)
+    if not 0.1 <= value <= 10000.0:
+        raise argparse.ArgumentTypeError(f"0.1 to 10000 mm expected, got {text}")
+    return 1e-3 * value
+
+
+def _pixels(text: str) -> int:
+    value = int(text)
+    if not 16 <= value <= 16384:
+        raise argparse.ArgumentTypeError(f"16 to 16384 pixels expected, got {text}")
+    return value
+
+
 def _weight(text: str) -> float:
     value = float(text)
     if not 0 <= value < float("inf"):
@@ -149,4 +228,5 @@ def _weight(text: str) -> float:
 
 
 # argparse puts these names into its messages: "invalid whole number value: 'x'"
-_seed.__name__ = _count.__name__ = "whole number"
+_seed.__name__ = _count.__name__ = _pixels.__name__ = "whole number"
+_millimetres.__name__ = _weight.__name__ = "number"

@@ -19,6 +19,8 @@ from dyngrasp.signals import Array, read_only
 # Corners of a view that a homography with some redundancy needs.
 LEAST_CORNERS = 8
 
+LEAST_VIEWS = 5
+
 # Standard deviation of the focal length as a share of it. Ten views with tilts of 30° have 0.15 %, of 6° 1.7 %, of 3°
 # 6 %, of none any number: then the board may be as well nearer and the lens shorter.
 MOST_FOCAL_DEVIATION = 0.03
@@ -74,13 +76,15 @@ class BoardView:
     def __post_init__(self) -> None:
         object.__setattr__(self, "pixels", read_only(self.pixels, (len(self.ids), 2)))
 
-    def determines_pose(self, board: Board) -> bool:
-        """Whether there are `LEAST_CORNERS`, and not all in one line."""
+    def shortcoming(self, board: Board) -> str | None:
+        """Why the view determines no pose with something to spare, in words; None where it does."""
+        if len(self.ids) == 0:
+            return "no board seen"
         if len(self.ids) < LEAST_CORNERS:
-            return False
+            return f"{len(self.ids)} corners seen, {LEAST_CORNERS} needed"
         places = board.corners[self.ids, :2]
         spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-        return bool(spread[1] > 0.1 * board.square)
+        return None if spread[1] > 0.1 * board.square else "all corners seen are in one line"
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +114,19 @@ class HandEyeCalibration:
         T_hand_camera: The mount.
         T_world_board: Where the board is.
         error: Root mean square of the reprojection errors' lengths (pixels).
-        deviation: (6,) standard deviations of the mount, [translation (m), rotation (rad)], of independent residuals.
+        view_errors: The same for each view; one that stands out has another posture than was noted.
+        deviation: (6,) standard deviations of the mount, [translation (m), rotation (rad)], of independent residuals,
+            if the lens is exact.
+        lens_deviation: (6,) what comes on top (in squares) if the lens was calibrated from views as many and as good
+            as these, or from these: a shift of its centre looks much like a turn of the camera.
     """
 
     T_hand_camera: pin.SE3
     T_world_board: pin.SE3
     error: float
+    view_errors: Array
     deviation: Array
+    lens_deviation: Array
 
 
 def find_board(image: NDArray[np.uint8], board: Board) -> BoardView:
@@ -148,8 +158,8 @@ def calibrate_lens(views: Sequence[BoardView], board: Board, camera: CameraModel
     Raises:
         InvalidProblem: Too few views, views with too few corners, or views so alike that the focal length stays open.
     """
-    if len(views) < 5:
-        raise InvalidProblem(f"a lens needs at least 5 views of the board, got {len(views)}")
+    if len(views) < LEAST_VIEWS:
+        raise InvalidProblem(f"a lens needs at least {LEAST_VIEWS} views of the board, got {len(views)}")
     _require_corners(views, board)
     objects = [board.corners[view.ids].astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32)[:, None] for view in views]
@@ -168,7 +178,7 @@ def calibrate_lens(views: Sequence[BoardView], board: Board, camera: CameraModel
         for turn, shift in zip(turns, shifts, strict=True)
     )
     errors = [_lengths(found, T, board, view) for T, view in zip(poses, views, strict=True)]
-    deviation = _focal_deviation(found, poses, board, views)
+    deviation = np.sqrt(np.diag(_lens_covariance(found, poses, board, views))[:2])
     share = np.max(deviation / found.focal)
     if not share < MOST_FOCAL_DEVIATION:
         raise InvalidProblem(
@@ -204,8 +214,8 @@ def calibrate_hand_eye(
     """
     if len(views) != len(T_world_hand):
         raise InvalidProblem(f"one pose of the hand for each view expected, got {len(T_world_hand)} for {len(views)}")
-    if len(views) < 5:
-        raise InvalidProblem(f"the mount needs at least 5 views of the board, got {len(views)}")
+    if len(views) < LEAST_VIEWS:
+        raise InvalidProblem(f"the mount needs at least {LEAST_VIEWS} views of the board, got {len(views)}")
     _require_corners(views, board)
     _require_turns(T_world_hand)
     T_camera_board = [_board_pose(camera, board, view) for view in views]
@@ -233,16 +243,28 @@ def calibrate_hand_eye(
     squares = float(found.fun @ found.fun)
     variance = squares / (found.fun.size - 12)
     deviation = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac))[:6])
+    mount, place = mount * pin.exp6(found.x[:6]), place * pin.exp6(found.x[6:])
+    ends = np.cumsum([2 * len(view.ids) for view in views])[:-1]
+    T_camera_board = [(T * mount).actInv(place) for T in T_world_hand]
+    covariance = _lens_covariance(camera, T_camera_board, board, views)
+    by_lens = [
+        _by_lens(camera, board.corners[view.ids] @ T.rotation.T + T.translation).reshape(-1, 8)
+        for T, view in zip(T_camera_board, views, strict=True)
+    ]
+    # How the mount that fits best moves with the lens that is believed.
+    slope = np.linalg.lstsq(found.jac, np.vstack(by_lens))[0][:6]
     return HandEyeCalibration(
-        T_hand_camera=mount * pin.exp6(found.x[:6]),
-        T_world_board=place * pin.exp6(found.x[6:]),
+        T_hand_camera=mount,
+        T_world_board=place,
         error=float(np.sqrt(2.0 * squares / found.fun.size)),
+        view_errors=np.array([np.sqrt(2.0 * np.mean(part**2)) for part in np.split(found.fun, ends)]),
         deviation=deviation,
+        lens_deviation=np.sqrt(np.diag(slope @ covariance @ slope.T)),
     )
 
 
 def _require_corners(views: Sequence[BoardView], board: Board) -> None:
-    poor = [k for k, view in enumerate(views) if not view.determines_pose(board)]
+    poor = [k for k, view in enumerate(views) if view.shortcoming(board)]
     if poor:
         raise InvalidProblem(
             f"views {poor} show fewer than {LEAST_CORNERS} corners of the board, or one line of them: leave them out"
@@ -274,28 +296,31 @@ def _residual(camera: CameraModel, T_camera_board: pin.SE3, board: Board, view: 
     return camera.project(points)[0] - view.pixels
 
 
-def _focal_deviation(
+def _lens_covariance(
     camera: CameraModel, T_camera_board: Sequence[pin.SE3], board: Board, views: Sequence[BoardView]
 ) -> Array:
-    """(2,) standard deviations (pixels). OpenCV's own are of no use where tilts are missing: it drops what is open."""
+    """(8, 8) of fx, fy, cx, cy, k1, k2, p1, p2. OpenCV's own is of no use without tilts: it drops what is open.
+
+    What a view's pose explains, errors of the arm among it, says nothing about the lens and is taken out.
+    """
     information, squares, count = np.zeros((8, 8)), 0.0, -8
     for T, view in zip(T_camera_board, views, strict=True):
         points = board.corners[view.ids] @ T.rotation.T + T.translation
         by_point = camera.project(points)[1]
         by_pose = np.concatenate([by_point, -by_point @ np.array([pin.skew(p) for p in points])], axis=2)
         by_lens, by_pose = _by_lens(camera, points).reshape(-1, 8), by_pose.reshape(-1, 6)
+        residual = _residual(camera, T, board, view).ravel()
         # What is left of the lens's columns once the pose has taken its part: the Schur complement, without squaring.
         basis = np.linalg.qr(by_pose)[0]
-        left = by_lens - basis @ (basis.T @ by_lens)
+        left, unexplained = by_lens - basis @ (basis.T @ by_lens), residual - basis @ (basis.T @ residual)
         information += left.T @ left
-        residual = _residual(camera, T, board, view)
-        squares += float(np.sum(residual**2))
+        squares += float(unexplained @ unexplained)
         count += residual.size - 6
     # Focal lengths (hundreds of pixels) and coefficients (hundredths) share a matrix: scaled, for its inverse.
     scale = np.sqrt(np.diag(information))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    inverse = np.sum(vectors**2 / np.maximum(values, np.finfo(float).eps), axis=1) / scale**2
-    return np.sqrt(squares / max(count, 1) * inverse[:2])
+    inverse = (vectors / np.maximum(values, np.finfo(float).eps)) @ vectors.T / np.outer(scale, scale)
+    return squares / max(count, 1) * inverse
 
 
 def _by_lens(camera: CameraModel, points: Array) -> Array:

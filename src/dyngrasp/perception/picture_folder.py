@@ -54,31 +54,35 @@ def read_table(folder: str | Path, joints: Sequence[str]) -> tuple[TakenPicture,
         InputFileError: The table is missing, lacks a column, or holds something that is no number.
     """
     path = Path(folder) / TABLE
-    try:
-        # utf-8-sig: spreadsheets put a mark before the first column's name.
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
-    except OSError as error:
-        raise InputFileError(path, None, None, f"cannot be read: {error.strerror or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputFileError(path, None, None, f"is no table of comma-separated values: {error}") from error
-    if not rows:
-        raise InputFileError(path, None, None, "a line of names and at least one row expected")
-    names = set(rows[0])
-    columns = [_joint_column(path, joint, names) for joint in joints]
-    for name in ("picture", "t_capture_s"):
-        if name not in names:
-            raise InputFileError(path, name, None, "this column is missing")
+    rows = _rows(path)
+    postures = _postures(path, rows, joints)
+    if "t_capture_s" not in rows[0]:
+        raise InputFileError(path, "t_capture_s", None, "this column is missing")
     pictures = []
-    for i, row in enumerate(rows):
+    for i, (row, (picture, angles)) in enumerate(zip(rows, postures, strict=True)):
         t = _number(path, i, "t_capture_s", row)
-        receipt = _number(path, i, "t_receipt_s", row) if "t_receipt_s" in names else t
+        receipt = _number(path, i, "t_receipt_s", row) if "t_receipt_s" in row else t
         if receipt < t:
             raise InputFileError(path, f"row {i + 1}: t_receipt_s", receipt, f"at least the time of capture, {t} s")
-        angles = [scale * _number(path, i, name, row) for name, scale in columns]
-        if not row["picture"]:
-            raise InputFileError(path, f"row {i + 1}: picture", row["picture"], "expected the name of a file")
-        pictures.append(TakenPicture(Path(folder) / row["picture"], t, receipt, np.array(angles)))
+        pictures.append(TakenPicture(picture, t, receipt, angles))
     return tuple(sorted(pictures, key=lambda picture: picture.t_receipt))
+
+
+def read_postures(folder: str | Path, joints: Sequence[str]) -> tuple[tuple[Path, Array], ...]:
+    """Pictures of an arm at rest, in the order of the table: it needs no times.
+
+    Args:
+        folder: Holds `frames.csv` and the pictures that it names.
+        joints: Names of the arm's joints.
+
+    Returns:
+        Path of each picture, and the (n,) angles at which it was taken (rad).
+
+    Raises:
+        InputFileError: As for `read_table`.
+    """
+    path = Path(folder) / TABLE
+    return tuple(_postures(path, _rows(path), joints))
 
 
 def table(pictures: Iterable[TakenPicture], joints: Sequence[str]) -> str:
@@ -90,6 +94,33 @@ def table(pictures: Iterable[TakenPicture], joints: Sequence[str]) -> str:
         numbers = (picture.t_capture, picture.t_receipt, *picture.arm_position)
         writer.writerow([picture.path.name, *(repr(float(number)) for number in numbers)])
     return text.getvalue()
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        # utf-8-sig: spreadsheets put a mark before the first column's name.
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
+    except OSError as error:
+        raise InputFileError(path, None, None, f"cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputFileError(path, None, None, f"is no table of comma-separated values: {error}") from error
+    if not rows:
+        raise InputFileError(path, None, None, "a line of names and at least one row expected")
+    return rows
+
+
+def _postures(path: Path, rows: list[dict[str, str]], joints: Sequence[str]) -> list[tuple[Path, Array]]:
+    names = set(rows[0])
+    columns = [_joint_column(path, joint, names) for joint in joints]
+    if "picture" not in names:
+        raise InputFileError(path, "picture", None, "this column is missing")
+    postures = []
+    for i, row in enumerate(rows):
+        angles = [scale * _number(path, i, name, row) for name, scale in columns]
+        if not row["picture"]:
+            raise InputFileError(path, f"row {i + 1}: picture", row["picture"], "expected the name of a file")
+        postures.append((path.parent / row["picture"], np.array(angles)))
+    return postures
 
 
 def _joint_column(path: Path, joint: str, names: set[str]) -> tuple[str, float]:
