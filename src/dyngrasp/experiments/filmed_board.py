@@ -42,10 +42,10 @@ POSTURE = np.deg2rad([0.0, -5.0, 0.0, -95.0, 0.0, 90.0, 0.0])
 
 # Of the views: distance of the camera from the board's middle (m), below which the fingers touch the ground; largest
 # tilt of the board and turn about its normal (rad); how far its middle is from the line of sight (m).
-DISTANCES, TILT, TURN, OFF_AXIS = (0.34, 0.52), np.deg2rad(52.0), np.deg2rad(70.0), 0.12
+DISTANCES, TILT, TURN, OFF_AXIS = (0.34, 0.52), np.deg2rad(52.0), np.deg2rad(70.0), 0.09
 
 # Share of the board's corners that has to be in the picture, fingers not counted.
-LEAST_SHARE = 0.4
+LEAST_SHARE = 0.5
 
 ATTEMPTS = 200
 
