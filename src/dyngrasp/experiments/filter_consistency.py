@@ -13,6 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from dyngrasp.experiments.filmed_approach import Film, FilmSet, Motion, film_set
@@ -135,17 +136,14 @@ def summary(motion: Motion, outcomes: Sequence[Outcome]) -> list[dict[str, Any]]
     rows = []
     for place, frames in enumerate(ASKED[: outcomes[0].normalised.size]):
         errors = np.array([outcome.errors[place] for outcome in outcomes])
-        known = np.isfinite(errors).all(axis=1)
+        known: NDArray[np.bool_] = np.isfinite(errors[:, 0])
         count = int(known.sum())
         low, high = chi2.ppf([0.025, 0.975], 6 * count) / count if count else (np.nan, np.nan)
         lengths = (
             np.sqrt(np.mean(np.sum(errors[known].reshape(-1, 2, 3) ** 2, axis=2), axis=0)) if count else [np.nan] * 2
         )
-        nees = (
-            float(np.mean([o.normalised[place] for o, k in zip(outcomes, known, strict=True) if k]))
-            if count
-            else np.nan
-        )
+        normalised = np.array([outcome.normalised[place] for outcome in outcomes])[known]
+        nees = float(normalised.mean()) if count else np.nan
         rows.append(
             {
                 "stage": "consistency",
