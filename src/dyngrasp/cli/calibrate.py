@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dyngrasp.cli.arguments import DELIVERED
+from dyngrasp.cli.arguments import DELIVERED, NOT_DELIVERED
 from dyngrasp.errors import InputFileError
 from dyngrasp.experiments.camera_calibration import (
     LensFound,
@@ -34,6 +34,9 @@ LEAST_COVERED, LEAST_TILT = 0.6, np.deg2rad(25.0)
 # Above it, something other than noise is at work: a bent board, wrong measures, a moving camera (pixels).
 LARGEST_ERROR = 0.5
 
+# Above it, what was found is of no use: pictures and postures, or pictures and board, do not belong together (pixels).
+WORTHLESS = 5.0
+
 
 def calibrate(options: argparse.Namespace) -> int:
     """Do what was asked for; every file it writes is a new one."""
@@ -43,11 +46,10 @@ def calibrate(options: argparse.Namespace) -> int:
         console = Console(width=140)
     board = Board(options.columns, options.rows, options.square, options.marker, options.dictionary)
     commands = {"camera": _lens, "handeye": _mount, "board": _board, "render": _render}
-    commands[options.what](options, board, console)
-    return DELIVERED
+    return commands[options.what](options, board, console)
 
 
-def _lens(options: argparse.Namespace, board: Board, console: Console) -> None:
+def _lens(options: argparse.Namespace, board: Board, console: Console) -> int:
     require_new_file(options.out)
     start = _camera(options)
     against = _against(options, start)
@@ -76,13 +78,16 @@ def _lens(options: argparse.Namespace, board: Board, console: Console) -> None:
     console.print(f"written to {escape(options.out)}")
     for advice in _lens_advice(found):
         console.print(f"[yellow]note[/]: {advice}")
+    if result.error > WORTHLESS:
+        return _worthless(console)
     console.print(
         f"next: [bold]dyngrasp calibrate handeye FOLDER --camera {escape(options.out)}[/] "
         "(the mount in this file is still the old one)"
     )
+    return DELIVERED
 
 
-def _mount(options: argparse.Namespace, board: Board, console: Console) -> None:
+def _mount(options: argparse.Namespace, board: Board, console: Console) -> int:
     require_new_file(options.out)
     camera = load_camera(options.camera)
     against = _against(options, camera)
@@ -117,13 +122,16 @@ def _mount(options: argparse.Namespace, board: Board, console: Console) -> None:
     console.print(f"written to {escape(options.out)}")
     for advice in _advice(found.pictures, result.error):
         console.print(f"[yellow]note[/]: {advice}")
+    if result.error > WORTHLESS:
+        return _worthless(console)
     console.print(
         "next: measure where the board's corner is and compare; then "
         f"[bold]dyngrasp run SCENARIO --pose camera --set camera.model={escape(options.out)}[/]"
     )
+    return DELIVERED
 
 
-def _board(options: argparse.Namespace, board: Board, console: Console) -> None:
+def _board(options: argparse.Namespace, board: Board, console: Console) -> int:
     from dyngrasp.experiments.output import OutputError, atomic
     from dyngrasp.perception.board_pictures import board_svg
 
@@ -140,9 +148,10 @@ def _board(options: argparse.Namespace, board: Board, console: Console) -> None:
     )
     console.print("next: print it at 100 %, glue it to something flat, and measure it over several squares;")
     console.print("if they are not that wide, say so to the other commands with --square-mm and --marker-mm")
+    return DELIVERED
 
 
-def _render(options: argparse.Namespace, board: Board, console: Console) -> None:
+def _render(options: argparse.Namespace, board: Board, console: Console) -> int:
     from dyngrasp.experiments.filmed_board import TRUTH, write_board_film
     from dyngrasp.simulation.camera_sensor import ImagingSettings
 
@@ -161,6 +170,12 @@ def _render(options: argparse.Namespace, board: Board, console: Console) -> None
         f"{lens_difference(camera, true):.1f} px, its mount by {1e3 * moved:.1f} mm and {np.rad2deg(turned):.2f}°"
     )
     console.print(f"next: [bold]dyngrasp calibrate camera {folder} --out lens.toml[/]")
+    return DELIVERED
+
+
+def _worthless(console: Console) -> int:
+    console.print(f"[bold red]not calibrated[/]: above {WORTHLESS:g} px the numbers mean nothing")
+    return NOT_DELIVERED
 
 
 def _camera(options: argparse.Namespace) -> CameraModel:

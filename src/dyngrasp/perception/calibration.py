@@ -115,8 +115,8 @@ class HandEyeCalibration:
         T_world_board: Where the board is.
         error: Root mean square of the reprojection errors' lengths (pixels).
         view_errors: The same for each view; one that stands out has another posture than was noted.
-        deviation: (6,) standard deviations of the mount, [translation (m), rotation (rad)], of independent residuals,
-            if the lens is exact.
+        deviation: (6,) standard deviations of the mount, [translation (m), rotation (rad)], if the lens is
+            exact; the arm's errors are counted as far as they differ from view to view.
         lens_deviation: (6,) what comes on top (in squares) if the lens was calibrated from views as many and as good
             as these, or from these: a shift of its centre looks much like a turn of the camera.
     """
@@ -240,13 +240,16 @@ def calibrate_hand_eye(
 
     # Lengths in metres and turns in radians matter about equally at arm's length: no scaling is needed.
     found = least_squares(residual, np.zeros(12), method="lm")
-    squares = float(found.fun @ found.fun)
-    variance = squares / (found.fun.size - 12)
-    deviation = np.sqrt(variance * np.diag(np.linalg.inv(found.jac.T @ found.jac))[:6])
-    mount, place = mount * pin.exp6(found.x[:6]), place * pin.exp6(found.x[6:])
     ends = np.cumsum([2 * len(view.ids) for view in views])[:-1]
+    # The corners of a view share the arm's error: views are independent of one another, corners need not be (White's
+    # covariance, by view). Twelve unknowns fit what six numbers of each view leave.
+    scores = [J.T @ r for J, r in zip(np.split(found.jac, ends), np.split(found.fun, ends), strict=True)]
+    bread = np.linalg.inv(found.jac.T @ found.jac)
+    covariance = len(views) / (len(views) - 2) * bread @ (np.transpose(scores) @ scores) @ bread
+    deviation = np.sqrt(np.diag(covariance)[:6])
+    mount, place = mount * pin.exp6(found.x[:6]), place * pin.exp6(found.x[6:])
     T_camera_board = [(T * mount).actInv(place) for T in T_world_hand]
-    covariance = _lens_covariance(camera, T_camera_board, board, views)
+    of_lens = _lens_covariance(camera, T_camera_board, board, views)
     by_lens = [
         _by_lens(camera, board.corners[view.ids] @ T.rotation.T + T.translation).reshape(-1, 8)
         for T, view in zip(T_camera_board, views, strict=True)
@@ -256,10 +259,10 @@ def calibrate_hand_eye(
     return HandEyeCalibration(
         T_hand_camera=mount,
         T_world_board=place,
-        error=float(np.sqrt(2.0 * squares / found.fun.size)),
+        error=float(np.sqrt(2.0 * np.mean(found.fun**2))),
         view_errors=np.array([np.sqrt(2.0 * np.mean(part**2)) for part in np.split(found.fun, ends)]),
         deviation=deviation,
-        lens_deviation=np.sqrt(np.diag(slope @ covariance @ slope.T)),
+        lens_deviation=np.sqrt(np.diag(slope @ of_lens @ slope.T)),
     )
 
 
