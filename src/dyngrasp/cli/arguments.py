@@ -116,7 +116,9 @@ def argument_parser(version: str) -> argparse.ArgumentParser:
     )
     bench_replan.add_argument("--json", metavar="FILE", help="write all rows, with machine and versions")
     bench_perception = benchmarks.add_parser("perception", help="from pictures to poses: times and accuracy")
-    bench_perception.add_argument("--runs", type=_count, metavar="N", default=10, help="a distance; default: 10")
+    bench_perception.add_argument(
+        "--runs", type=_count, metavar="N", default=3, help="a distance and angle; default: 3"
+    )
     bench_perception.add_argument(
         "--seed", type=_seed, metavar="S", default=0, help="draws views and noise; default: 0"
     )

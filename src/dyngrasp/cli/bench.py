@@ -60,13 +60,19 @@ def _perception(options: argparse.Namespace) -> int:
     resolution = (640, 480) if options.small else None
     with console.status("…") as status:
         rows = bench_perception(options.runs, options.seed, resolution, progress=status.update)
-    for accuracy, title in ((False, "from a picture to a pose"), (True, "a part at rest, against the truth")):
-        chosen = [row for row in rows if (row["stage"] == "accuracy") is accuracy]
-        table = Table(title=title)
-        for name in chosen[0]:
+    for title, shown in (
+        (f"From a picture of {rows[0]['resolution']} to a pose, one thread", [r for r in rows if "median_ms" in r]),
+        ("A part at rest, against the truth", [r for r in rows if r["stage"] == "accuracy"]),
+        ("Noise an axis while the hand nears, and the noise model's", [r for r in rows if r["stage"] == "noise"]),
+        ("Wrong poses, and jumps of the part", [r for r in rows if r["stage"] == "outliers"]),
+    ):
+        hidden = {"resolution"} if "median_ms" in shown[0] else {"resolution", "stage"}
+        table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+        for name in (name for name in shown[0] if name not in hidden):
             table.add_column(name, justify="right")
-        for row in chosen:
-            table.add_row(*(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values()))
+        for row in shown:
+            values = (value for name, value in row.items() if name not in hidden)
+            table.add_row(*(f"{value:.3g}" if isinstance(value, float) else str(value) for value in values))
         console.print(table)
     if options.json:
         arguments = {"runs": options.runs, "seed": options.seed}

@@ -1,35 +1,32 @@
-"""How long a picture takes to become a pose, and how good poses are against distance, on rendered pictures."""
+"""From rendered pictures to poses: how long it takes, how good poses are from where, and what wrong ones do."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.models.camera import CameraModel
-from dyngrasp.models.catalogue import load_camera, load_gripper, load_object, load_robot
-from dyngrasp.perception.marker_detection import MarkerDetector
+from dyngrasp.experiments.filmed_approach import ASIDE, FilmSet, Motion, film_set, view
+from dyngrasp.experiments.pose_noise_fit import fit_pose_noise, pose_errors, sightings
+from dyngrasp.experiments.pose_outliers import outlier_row
+from dyngrasp.models.catalogue import load_camera, load_gripper
+from dyngrasp.perception.marker_detection import one_thread
 from dyngrasp.perception.marker_pose import MarkerPoseSolver
 from dyngrasp.perception.pose_filter import PoseFilter, PoseFilterSettings
 from dyngrasp.signals import Array
-from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
-from dyngrasp.simulation.mujoco_plant import MujocoPlant
-from dyngrasp.simulation.scene import build_scene
 
-DISTANCES = (0.25, 0.35, 0.45, 0.6)
+# From the camera to the middle of the part's upper markers (m), and of the view against their vertical (degrees).
+DISTANCES = (0.25, 0.3, 0.4, 0.5, 0.6)
+ANGLES = (0.0, 15.0, 30.0, 45.0, 60.0, 70.0)
 
-# The hand some 0.6 m above the ground, looking straight down; it drifts by up to this much (rad) in every run.
-POSTURE = np.deg2rad([0.0, -5.0, 0.0, -95.0, 0.0, 90.0, 0.0])
-DRIFT = np.deg2rad(4.0)
+# Pictures of each run; while they are taken the view moves by up to this much: turn and tilt (rad), aside (m).
+FRAMES = 10
+DRIFT = (np.deg2rad(5.0), np.deg2rad(2.0), 0.01)
 
-# The part's upper markers about the middle of the picture (m), tilted by up to this much (rad).
-ASIDE, TILT = 0.02, 0.5
-
-FRAMES = 12
+STAGES = ("detect", "pose", "filter", "frame")
 
 
 def bench_perception(
@@ -37,123 +34,128 @@ def bench_perception(
     seed: int,
     resolution: tuple[int, int] | None = None,
     distances: Sequence[float] = DISTANCES,
+    angles: Sequence[float] = ANGLES,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[dict[str, Any]]:
-    """Look at a part at rest from a moving hand, and compare with the truth.
+    """Look at a part at rest from a moving camera and from a hand that approaches it, and compare with the truth.
 
     Args:
-        runs: Of each distance, of `FRAMES` pictures each.
+        runs: Of each distance and angle, of `FRAMES` pictures each. Twice as many approaches are filmed, of a part at
+            rest and of one on a belt.
         seed: Draws views, motions and noise.
         resolution: Width and height; the camera's own if left out.
         distances: From the camera to the middle of the part's upper markers (m).
+        angles: Of the view against the vertical of these markers (degrees).
         progress: Told what is going on.
 
     Returns:
-        Rows: `stage` detect, pose, filter and frame (all three together) with times, and `stage` accuracy with the
-        errors of single pictures and of the filter after the last one; `nees` is the mean of eᵀP⁻¹e, of six numbers.
+        Rows of every `stage`: detect, pose, filter and frame (all three together) with wall and CPU times on one
+        thread; accuracy with the share of recognised pictures and the errors of single pictures and of the filter after
+        the last one (`nees` is the mean of eᵀP⁻¹e, of six numbers); noise, see `PoseNoiseFit.rows`; outliers, see
+        `outlier_row`.
 
     Raises:
         RenderingUnavailable: The machine cannot draw off screen.
     """
     camera = load_camera("ava1000")
     camera = camera if resolution is None else camera.scaled(*resolution)
-    robot, gripper, part = load_robot("iiwa14"), load_gripper("sdh2"), load_object("casting")
-    scene = build_scene(robot, gripper, part, markers=True)
-    detector, solver = MarkerDetector(part), MarkerPoseSolver(camera, part)
-    resting = MujocoPlant(scene, POSTURE, gripper.open_posture, pin.SE3.Identity()).state
-    settings = replace(PoseFilterSettings.still(), acquire_frames=3)
     rng = np.random.default_rng(seed)
-    times: dict[str, list[float]] = {"detect": [], "pose": [], "filter": [], "frame": []}
-    rows = []
-    with CameraSensor(scene, camera, ImagingSettings(seed=seed)) as sensor:
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in STAGES}
+    rows, extra = [], []
+    with film_set(camera, seed=seed) as stage, one_thread():
         for distance in distances:
-            single: list[Array] = []
-            filtered: list[Array] = []
-            normalised: list[float] = []
-            for run in range(runs):
-                progress(f"{distance:g} m: {run} of {runs}")
-                T_world_part = sensor.pose(resting) * _view(rng, distance)
-                drift = rng.uniform(-DRIFT, DRIFT, POSTURE.size) / FRAMES
-                pose_filter = PoseFilter(settings)
-                for k in range(FRAMES):
-                    state = resting.copy()
-                    state[scene.arm_qpos] = POSTURE + k * drift
-                    x, y, z, w = pin.Quaternion(T_world_part.rotation).coeffs()
-                    state[scene.part_qpos : scene.part_qpos + 7] = [*T_world_part.translation, w, x, y, z]
-                    t = k / camera.rate
-                    image = sensor.capture([state], [t])
-                    T_world_camera = sensor.pose(state)
-                    began = time.perf_counter()
-                    found = detector.detect(image.pixels)
-                    detected = time.perf_counter()
-                    sighting = solver.solve(found)
-                    solved = time.perf_counter()
-                    candidates = [c.in_world(T_world_camera, t, t) for c in sighting.plausible]
-                    if candidates:
-                        pose_filter.update(candidates)
-                    done = time.perf_counter()
-                    steps = (detected - began, solved - detected, done - solved, done - began)
-                    for name, taken in zip(times, steps, strict=True):
-                        times[name].append(1e3 * taken)
-                    if candidates:
-                        single.append(_error(candidates[0].T_world_object, T_world_part))
-                if pose_filter.acquired:
-                    estimate = pose_filter.estimate((FRAMES - 1) / camera.rate)
-                    e = _error(estimate.T_world_object, T_world_part)
-                    filtered.append(e)
-                    normalised.append(float(e @ np.linalg.solve(estimate.covariance, e)))
-            rows.append(_accuracy(distance, camera, runs, single, filtered, normalised))
-    return [_timing(name, values, camera) for name, values in times.items()] + rows
-
-
-def _view(rng: np.random.Generator, distance: float) -> pin.SE3:
-    """T_camera_object: the upper side towards the camera, turned and tilted at random."""
-    axis = rng.uniform(-np.pi, np.pi)
-    tilt = pin.exp3(rng.uniform(0, TILT) * np.array([np.cos(axis), np.sin(axis), 0.0]))
-    facing = tilt @ np.diag([1.0, -1.0, -1.0]) @ pin.exp3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
-    T = pin.SE3(facing, np.array([*rng.uniform(-ASIDE, ASIDE, 2), distance]))
-    return T * pin.SE3(np.eye(3), np.array([-0.02, 0.0, 0.055]))
-
-
-def _error(found: pin.SE3, true: pin.SE3) -> Array:
-    return pin.log6(found.actInv(true)).vector
-
-
-def _timing(stage: str, values: list[float], camera: CameraModel) -> dict[str, Any]:
-    return {
-        "stage": stage,
-        "resolution": f"{camera.width}x{camera.height}",
-        "n": len(values),
-        "median_ms": float(np.median(values)),
-        "p99_ms": float(np.percentile(values, 99)),
-        "max_ms": float(np.max(values)),
-    }
+            for angle in angles:
+                progress(f"{distance:g} m, {angle:g}°")
+                rows.append(_accuracy(stage, rng, distance, angle, runs, times))
+        solver = MarkerPoseSolver(camera, stage.part)
+        settings: dict[Motion, PoseFilterSettings] = {
+            "still": PoseFilterSettings.still(),
+            "conveyor": PoseFilterSettings(),
+        }
+        for motion, of_filter in settings.items():
+            progress(f"approaches, part {motion}")
+            films = [stage.shoot(rng, motion) for _ in range(2 * runs)]
+            if motion == "still":
+                errors = pose_errors(films, camera, stage.part, load_gripper("sdh2"), seed)
+                extra += fit_pose_noise(errors).rows()
+            extra.append(outlier_row(motion, films, [sightings(film, solver) for film in films], seed, of_filter))
+    resolution_text = f"{camera.width}x{camera.height}"
+    return [{"resolution": resolution_text, **row} for row in [*_timing(times), *rows, *extra]]
 
 
 def _accuracy(
+    stage: FilmSet,
+    rng: np.random.Generator,
     distance: float,
-    camera: CameraModel,
+    angle: float,
     runs: int,
-    single: list[Array],
-    filtered: list[Array],
-    normalised: list[float],
+    times: dict[str, list[tuple[float, float]]],
 ) -> dict[str, Any]:
-    def rms(errors: list[Array], part: slice) -> float | None:
-        return float(np.sqrt(np.mean(np.sum(np.square(errors)[:, part], axis=1)))) if errors else None
-
-    def times(value: float | None, factor: float) -> float | None:
-        return None if value is None else value * factor
-
-    shift, turn = slice(0, 3), slice(3, 6)
+    solver, rate = MarkerPoseSolver(stage.camera, stage.part), stage.camera.rate
+    single: list[Array] = []
+    filtered: list[Array] = []
+    normalised: list[float] = []
+    for _ in range(runs):
+        towards, turn = rng.uniform(-np.pi, np.pi, 2)
+        aside = rng.uniform(-ASIDE, ASIDE, 2)
+        drift = rng.uniform(-1.0, 1.0, 4) * np.array([DRIFT[0], DRIFT[1], DRIFT[2], DRIFT[2]])
+        pose_filter = PoseFilter(PoseFilterSettings.still())
+        for k in range(FRAMES):
+            moved = drift * (k / (FRAMES - 1) - 0.5)
+            T = view(distance, np.deg2rad(angle) + moved[1], towards, turn + moved[0], aside + moved[2:])
+            pixels, t = stage.look(T), k / rate
+            # The world is the part here: the camera moves about it.
+            T_world_camera = T.inverse()
+            clocks = [_clocks()]
+            found = stage.detector.detect(pixels)
+            clocks.append(_clocks())
+            sighting = solver.solve(found)
+            clocks.append(_clocks())
+            candidates = [c.in_world(T_world_camera, t, t) for c in sighting.plausible]
+            if candidates:
+                pose_filter.update(candidates)
+            clocks.append(_clocks())
+            taken = np.diff(np.array(clocks), axis=0)
+            for name, (wall, cpu) in zip(STAGES, [*taken, taken.sum(axis=0)], strict=True):
+                times[name].append((float(wall), float(cpu)))
+            if candidates:
+                single.append(pin.log6(candidates[0].T_world_object.inverse()).vector)
+        if pose_filter.acquired:
+            estimate = pose_filter.estimate((FRAMES - 1) / rate)
+            e = pin.log6(estimate.T_world_object.inverse()).vector
+            filtered.append(e)
+            normalised.append(float(e @ np.linalg.solve(estimate.covariance, e)))
     return {
         "stage": "accuracy",
-        "resolution": f"{camera.width}x{camera.height}",
         "distance_m": distance,
-        "runs": runs,
-        "acquired": len(filtered),
-        "single_rms_mm": times(rms(single, shift), 1e3),
-        "single_rms_deg": times(rms(single, turn), np.rad2deg(1.0)),
-        "rms_mm": times(rms(filtered, shift), 1e3),
-        "rms_deg": times(rms(filtered, turn), np.rad2deg(1.0)),
+        "angle_deg": angle,
+        "pictures": runs * FRAMES,
+        "recognised": len(single) / (runs * FRAMES),
+        "single_rms_mm": _rms(single, slice(0, 3), 1e3),
+        "single_rms_deg": _rms(single, slice(3, 6), np.rad2deg(1.0)),
+        "acquired": len(filtered) / runs,
+        "rms_mm": _rms(filtered, slice(0, 3), 1e3),
+        "rms_deg": _rms(filtered, slice(3, 6), np.rad2deg(1.0)),
         "nees": float(np.mean(normalised)) if normalised else None,
     }
+
+
+def _clocks() -> tuple[float, float]:
+    return time.perf_counter(), time.thread_time()
+
+
+def _rms(errors: list[Array], axes: slice, unit: float) -> float | None:
+    """Of lengths."""
+    return float(unit * np.sqrt(np.mean(np.sum(np.square(errors)[:, axes], axis=1)))) if errors else None
+
+
+def _timing(times: dict[str, list[tuple[float, float]]]) -> list[dict[str, Any]]:
+    rows = []
+    for name, values in times.items():
+        row: dict[str, Any] = {"stage": name, "n": len(values)}
+        for clock, taken in zip(("", "cpu_"), 1e3 * np.array(values).T, strict=True):
+            row[f"{clock}median_ms"] = float(np.median(taken))
+            row[f"{clock}p99_ms"] = float(np.percentile(taken, 99))
+            row[f"{clock}max_ms"] = float(taken.max())
+        rows.append(row)
+    return rows

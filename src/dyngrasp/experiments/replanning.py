@@ -82,7 +82,10 @@ def pose_source(section: PoseSection, trial: Trial, grasp: Grasp) -> PoseSource:
         residual_position=1e-3 * section.residual_mm,
         residual_angle=np.deg2rad(section.residual_deg),
         frame_position=1e-3 * section.frame_mm,
+        frame_position_growth=1e-3 * section.frame_mm_per_m2,
         frame_angle=np.deg2rad(section.frame_deg),
+        frame_angle_growth=np.deg2rad(section.frame_deg_per_m2),
+        correlation_time=section.correlation_s,
         frame_velocity=1e-3 * section.frame_mm_s,
         frame_spin=np.deg2rad(section.frame_deg_s),
     )

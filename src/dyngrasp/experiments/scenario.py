@@ -155,7 +155,8 @@ class PoseSection(StrictSchema):
 
     With `source = "camera"` the first pose is off in the same way, and then the replanner is told what the table
     `[camera]` sees. `motion` says what is known of the part beforehand: whether its velocity is estimated at all. The
-    remaining keys are for `"noise"`: what a camera would reveal, see `PoseNoiseSettings`.
+    remaining keys are for `"noise"`: what a camera would reveal, see `PoseNoiseSettings`; their defaults are fitted to
+    the rendered camera.
     """
 
     source: Literal["truth", "noise", "camera"] = "truth"
@@ -170,9 +171,12 @@ class PoseSection(StrictSchema):
     reveal_from_m: NonNegative = 0.40
     reveal_to_m: NonNegative = 0.15
     residual_mm: NonNegative = 1.0
-    residual_deg: NonNegative = 0.5
-    frame_mm: NonNegative = 0.2
-    frame_deg: NonNegative = 0.05
+    residual_deg: NonNegative = 0.3
+    frame_mm: NonNegative = 0.03
+    frame_mm_per_m2: NonNegative = 1.7
+    frame_deg: NonNegative = 0.04
+    frame_deg_per_m2: NonNegative = 1.8
+    correlation_s: NonNegative = 1.4
     frame_mm_s: NonNegative = 1.0
     frame_deg_s: NonNegative = 0.1
 

@@ -6,6 +6,8 @@ markers; corners are then refined in the picture itself, so that nothing is lost
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -142,3 +144,14 @@ class MarkerDetector:
         window = int(np.clip(round(s.refinement_share * side / self._modules), 1, s.refinement_window))
         corners = np.array(square, dtype=np.float32, order="C")
         return cv2.cornerSubPix(grey, corners, (window, window), (-1, -1), _REFINED).astype(float)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Detection uses no more than the calling thread: to measure it, or where others need the cores."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

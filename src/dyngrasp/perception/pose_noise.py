@@ -1,7 +1,8 @@
 """Pose estimates without a camera: the truth with the error that a camera on the hand would leave, smaller as it nears.
 
 At first the part is believed to be where somebody said; what was wrong with that is revealed linearly with the
-distance between hand and part, down to an error that stays, as calibration leaves it, and noise from frame to frame.
+distance between hand and part, down to an error that stays, as calibration leaves it, and noise that grows with the
+distance and changes slowly, as that of a filter does.
 """
 
 from __future__ import annotations
@@ -19,20 +20,30 @@ from dyngrasp.signals import Array, PoseEstimate
 class PoseNoiseSettings:
     """Settings of `PoseNoise`.
 
+    The defaults of residual and frame are those of the rendered camera with the hand-eye error of
+    `scenarios/camera_sdh2.toml`, rounded, from `python benchmarks/pose_noise.py --films 24 --seed 3`.
+
     Attributes:
         reveal_from: Distance of G from the grasp frame above which nothing of the first error is known (m).
         reveal_to: Distance below which all of it is (m).
         residual_position, residual_angle: Radius (m) and largest angle (rad) of the error that stays, drawn once.
-        frame_position, frame_angle: Standard deviation of each axis from frame to frame (m, rad).
-        frame_velocity, frame_spin: The same of the velocities of a moving part (m/s, rad/s).
+        frame_position, frame_angle: Standard deviation of each axis at no distance (m, rad).
+        frame_position_growth, frame_angle_growth: By how much that grows with the square of the distance (m/m²,
+            rad/m²).
+        correlation_time: After which the correlation of that noise has fallen to 1/e (s); 0 makes frames independent.
+        frame_velocity, frame_spin: Standard deviation of the velocities of a moving part, independent from frame to
+            frame (m/s, rad/s).
     """
 
     reveal_from: float = 0.40
     reveal_to: float = 0.15
     residual_position: float = 0.001
-    residual_angle: float = np.deg2rad(0.5)
-    frame_position: float = 0.0002
-    frame_angle: float = np.deg2rad(0.05)
+    residual_angle: float = np.deg2rad(0.3)
+    frame_position: float = 0.00003
+    frame_angle: float = np.deg2rad(0.04)
+    frame_position_growth: float = 0.0017
+    frame_angle_growth: float = np.deg2rad(1.8)
+    correlation_time: float = 1.4
     frame_velocity: float = 0.001
     frame_spin: float = np.deg2rad(0.1)
 
@@ -41,10 +52,21 @@ class PoseNoiseSettings:
             raise InvalidProblem(f"0 ≤ reveal_to < reveal_from expected, got {self.reveal_to}, {self.reveal_from} m")
         numbers = (
             *(self.residual_position, self.residual_angle, self.frame_position, self.frame_angle),
+            *(self.frame_position_growth, self.frame_angle_growth, self.correlation_time),
             *(self.frame_velocity, self.frame_spin),
         )
         if not (np.isfinite(numbers).all() and min(numbers) >= 0):
-            raise InvalidProblem(f"errors of a pose must be ≥ 0, got {numbers}")
+            raise InvalidProblem(f"errors of a pose and their correlation time must be ≥ 0, got {numbers}")
+
+    def deviation(self, distance: float) -> Array:
+        """(6,) standard deviation of the frames' noise at a distance of G from the grasp frame (m): m, then rad."""
+        return np.repeat(
+            [
+                self.frame_position + self.frame_position_growth * distance**2,
+                self.frame_angle + self.frame_angle_growth * distance**2,
+            ],
+            3,
+        )
 
 
 class PoseNoise:
@@ -79,6 +101,7 @@ class PoseNoise:
         offset = _direction(self._rng) * settings.residual_position * self._rng.uniform() ** (1 / 3)
         turn = _direction(self._rng) * settings.residual_angle * self._rng.uniform()
         self._residual = np.concatenate([offset, turn])
+        self._noise, self._t = self._rng.normal(size=6), -np.inf
 
     def hidden_share(self, distance: float) -> float:
         """What part of the first error is not known yet at a distance (m): 1 far away, 0 near."""
@@ -98,9 +121,9 @@ class PoseNoise:
         """
         s = self.settings
         T_world_grasp = T_world_object * self._T_object_grasp
-        share = self.hidden_share(float(np.linalg.norm(p_world_hand - T_world_grasp.translation)))
-        scale = np.repeat([s.frame_position, s.frame_angle], 3)
-        error = share * self._first + (1.0 - share) * self._residual + scale * self._rng.normal(size=6)
+        distance = float(np.linalg.norm(p_world_hand - T_world_grasp.translation))
+        share, scale = self.hidden_share(distance), s.deviation(distance)
+        error = share * self._first + (1.0 - share) * self._residual + scale * self._noise_at(t)
         variance = (
             scale**2 + np.repeat([s.residual_position, s.residual_angle], 3) ** 2 / 5 + (share * self._first) ** 2
         )
@@ -112,6 +135,14 @@ class PoseNoise:
             noise = np.repeat([s.frame_velocity, s.frame_spin], 3) * self._rng.normal(size=6)
             twist = twist_world + share * self._first_twist + noise
         return PoseEstimate(T, covariance, t, t, twist)
+
+    def _noise_at(self, t: float) -> Array:
+        """(6,) of variance one: a first-order Gauss-Markov process, asked at whatever times."""
+        tau = self.settings.correlation_time
+        kept = float(np.exp(-abs(t - self._t) / tau)) if tau > 0 else 0.0
+        self._noise = kept * self._noise + np.sqrt(1.0 - kept**2) * self._rng.normal(size=6)
+        self._t = t
+        return self._noise
 
 
 def _direction(rng: np.random.Generator) -> Array:
