@@ -160,7 +160,10 @@ class TestPicturesThatCannotBeUsed:
         assert "at least 5" in refused(*command)
 
     def test_another_board(self, refused, command):
-        assert "at least 5" in refused(*command, "--dictionary", "6x6_50")
+        for option, value, words in (("--dictionary", "6x6_50", "6x6_50"), ("--columns", "9", "9 x 6")):
+            message = refused(*command, option, value)
+            assert "at least 5" in message
+            assert words in message
 
     def test_another_size(self, refused, folder, command):
         (folder / "3.png").write_bytes(png(np.zeros((240, 320), np.uint8)))

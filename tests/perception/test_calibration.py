@@ -182,7 +182,9 @@ def test_one_line_of_corners_determines_no_pose():
     assert BoardView(np.array([*range(10), 14]), np.zeros((11, 2))).shortcoming(board) is None
 
 
-@pytest.mark.parametrize("change", [{"columns": 2}, {"marker": 0.05}, {"columns": 20, "rows": 20}])
+@pytest.mark.parametrize(
+    "change", [{"columns": 2}, {"columns": 3, "rows": 3}, {"marker": 0.05}, {"columns": 20, "rows": 20}]
+)
 def test_impossible_boards_are_refused(change):
     with pytest.raises(InvalidProblem):
         Board(**change)

@@ -242,6 +242,11 @@ def _look(folder: Path, paths: Sequence[Path], board: Board, camera: CameraModel
             )
         view = find_board(pixels, board)
         pictures.append(LookedAt(path, view, view.shortcoming(board)))
+    if not any(len(picture.view.ids) for picture in pictures):
+        raise InputFileError(
+            folder, "views", 0, f"at least {LEAST_VIEWS} expected, but no picture shows a board of {board.columns} x "
+            f"{board.rows} squares with markers {board.dictionary}: is it another, or are columns and rows swapped?",
+        )  # fmt: skip
     return pictures
 
 

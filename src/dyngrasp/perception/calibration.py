@@ -48,6 +48,11 @@ class Board:
     def __post_init__(self) -> None:
         if self.columns < 3 or self.rows < 3:
             raise InvalidProblem(f"a board of at least 3 × 3 squares expected, got {self.columns} × {self.rows}")
+        inner = (self.columns - 1) * (self.rows - 1)
+        if inner < LEAST_CORNERS:
+            raise InvalidProblem(
+                f"{self.columns} × {self.rows} squares have {inner} corners between them, {LEAST_CORNERS} are needed"
+            )
         if not 0.0 < self.marker < self.square:
             raise InvalidProblem(f"0 < marker < square expected, got {self.marker} and {self.square} m")
         markers = self.columns * self.rows // 2
