@@ -170,7 +170,7 @@ class PoseSection(StrictSchema):
     draw: Literal["ball", "planar"] = "ball"
     reveal_from_m: NonNegative = 0.40
     reveal_to_m: NonNegative = 0.15
-    residual_mm: NonNegative = 1.0
+    residual_mm: NonNegative = 0.9
     residual_deg: NonNegative = 0.3
     frame_mm: NonNegative = 0.03
     frame_mm_per_m2: NonNegative = 1.7

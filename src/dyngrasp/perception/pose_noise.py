@@ -37,7 +37,7 @@ class PoseNoiseSettings:
 
     reveal_from: float = 0.40
     reveal_to: float = 0.15
-    residual_position: float = 0.001
+    residual_position: float = 0.0009
     residual_angle: float = np.deg2rad(0.3)
     frame_position: float = 0.00003
     frame_angle: float = np.deg2rad(0.04)

@@ -55,9 +55,8 @@ def _deviation(ax: Axes, fit: PoseNoiseFit, axes: slice, unit: float, name: str,
     top = 1.15 * max(np.percentile(size, 99.0), unit * model.max())
     ax.set_ylim(0.0, top)
     if above := int((size > top).sum()):
-        ax.text(
-            1.0, 1.0, f"{above} dots above", transform=ax.transAxes, ha="right", va="bottom", fontsize=7, color=FAINT
-        )
+        note = f"{above} dots above"
+        ax.text(1.0, 0.99, note, transform=ax.transAxes, ha="right", va="top", fontsize=7, color="#6a6a72")
     ax.set_xlim(0.0, 1.03 * float(errors.distance.max()))
     ax.set_xlabel("distance of the hand from the grasp, d (m)")
     _grid(ax)
