@@ -17,7 +17,11 @@ __all__ = ["Path", "PhasePlanner", "ReplanResult", "Replanner", "ReplannerSettin
 
 
 class Replanner:
-    """Replaces running plans; keeps no state between calls but what it has computed of the task."""
+    """Replaces running plans; keeps no state between calls but what it has computed of the task.
+
+    The first call loads compiled code and takes long. Later on, a pass of Python's garbage collector over all that a
+    process has made can take 0.1 s: call `gc.freeze()` once everything is set up and warm.
+    """
 
     def __init__(
         self,
