@@ -303,7 +303,7 @@ def test_what_repeats_is_averaged_as_the_view_changes():
     random = np.random.default_rng(7)
     ends = []
     for change in (0.0, 0.1):
-        pose_filter = PoseFilter(replace(STILL, camera=CameraErrors(repeating=0.9, view_change=0.35)))
+        pose_filter = PoseFilter(replace(STILL, camera=CameraErrors(mount=(0.0, 0.0), repeating=0.9, view_change=0.35)))
         for k in range(100):
             view = pin.SE3(pin.exp3(np.array([0.0, 0.0, k * change])), np.array([0.0, 0.0, 0.4]))
             pose_filter.update(seen(random, pin.SE3.Identity(), k * FRAME, view))

@@ -1,7 +1,5 @@
 """Pictures of the running simulation: markers are where the camera model says, and poses come out of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pinocchio as pin
 import pytest

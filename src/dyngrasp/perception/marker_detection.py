@@ -56,6 +56,11 @@ class DetectionSettings:
             )
 
 
+# Blur rounds corners off, and the refinement puts them inside by this over the half size of its window (pixels): measured
+# 0.18, 0.14 and 0.10 for 3, 4 and 5 on 9000 rendered markers between 0.25 and 0.6 m.
+ROUNDED_OFF = 0.5
+
+
 @dataclass(frozen=True, eq=False)
 class MarkerCorners:
     """One marker in a picture.
@@ -142,8 +147,11 @@ class MarkerDetector:
         s = self.settings
         side = float(np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1).mean())
         window = int(np.clip(round(s.refinement_share * side / self._modules), 1, s.refinement_window))
-        corners = np.array(square, dtype=np.float32, order="C")
-        return cv2.cornerSubPix(grey, corners, (window, window), (-1, -1), _REFINED).astype(float)
+        found = np.array(square, dtype=np.float32, order="C")
+        corners = cv2.cornerSubPix(grey, found, (window, window), (-1, -1), _REFINED).astype(float)
+        outward = corners - corners.mean(axis=0)
+        length = np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1.0)
+        return corners + ROUNDED_OFF / window * outward / length
 
 
 @contextmanager

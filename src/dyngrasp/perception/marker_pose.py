@@ -31,7 +31,8 @@ class MarkerPoseSettings:
     """Settings of `MarkerPoseSolver`.
 
     Attributes:
-        corner_noise: Standard deviation of a refined corner of a marker seen from the front (pixels). It is taken to
+        corner_noise: Standard deviation of a refined corner of a marker seen from the front (pixels), that of rendered
+            pictures (`benchmarks/filter_consistency.py`). It is taken to
             grow as the longest side of the seen square over the shortest, and residuals count less by as much. Larger
             residuals enlarge the covariance; smaller ones do not shrink it: eight numbers say little about a variance.
         coarse_agreement: A marker belongs to a first guess, made from another marker, if its corners are within this
@@ -42,7 +43,7 @@ class MarkerPoseSettings:
         steps: Of Gauss-Newton at most.
     """
 
-    corner_noise: float = 0.2
+    corner_noise: float = 0.11
     coarse_agreement: float = 15.0
     agreement: float = 2.0
     largest_error: float = 1.5
