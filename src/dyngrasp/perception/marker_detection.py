@@ -56,8 +56,8 @@ class DetectionSettings:
             )
 
 
-# Blur rounds corners off, and the refinement puts them inside by this over the half size of its window (pixels): measured
-# 0.18, 0.14 and 0.10 for 3, 4 and 5 on 9000 rendered markers between 0.25 and 0.6 m.
+# Blur rounds corners off, and the refinement puts them inside by this over the half size of its window (pixels):
+# measured 0.18, 0.14 and 0.10 for 3, 4 and 5 on 9000 rendered markers between 0.25 and 0.6 m.
 ROUNDED_OFF = 0.5
 
 
