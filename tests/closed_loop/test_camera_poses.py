@@ -186,5 +186,7 @@ def test_the_paper_from_pictures(stage, name, replanning):
         before = [r for r in executed.vision.reports if r.frame.t_receipt < executed.plan.phase_ends[0]]
         assert before[-1].estimate is not None
         twist = before[-1].estimate.twist_world
-        np.testing.assert_allclose(twist, trial.twist_world, atol=0.01)
+        # What pictures tell of a rotation, 0.3°, over the third of a second that counts.
+        assert np.abs(twist - trial.twist_world)[:3].max() < 0.01
+        assert np.abs(twist - trial.twist_world)[3:].max() < 0.03
         assert twist.any() == name.startswith("conveyor")

@@ -53,9 +53,8 @@ class CameraErrors:
     """What the poses of one camera have in common.
 
     The defaults hold for rendered pictures, where `benchmarks/filter_consistency.py` measures what a corner's error has
-    in common with that of another picture: 0.87 of its variance while the view hardly changes, 0.75 after a change of
-    0.3, 0.54 after 0.6, 0.24 after 1.2. Of poses, whose covariance supposes corners of 0.2 pixels where 0.14 are found,
-    less: share and scale were chosen for the normalised errors of filtered poses, on films of other seeds than those
+    in common with that of another picture: 0.6 to 0.7 of its variance up to a change of 0.3, 0.46 after 0.6, 0.09 after
+    1.2. Share and scale were chosen for the normalised errors of filtered poses, on films of other seeds than those
     that are reported.
 
     Attributes:
