@@ -22,7 +22,7 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.errors import PlanningFailed
-from dyngrasp.experiments.bench_replan import START_DEG, Cell, make_cell
+from dyngrasp.experiments.bench_replan import START_DEG, Cell, make_cell, splice_jump
 from dyngrasp.experiments.output import write_json
 from dyngrasp.experiments.provenance import machine, versions
 from dyngrasp.planning.audit import audit
@@ -79,7 +79,7 @@ def draw(targets: GraspTargets, t: float, rng: np.random.Generator) -> tuple[str
 def offences(running: GraspPlan, result: ReplanResult, estimate: PoseEstimate, replanner: Replanner) -> list[str]:
     """What is wrong with a published plan; nothing, it is hoped."""
     found = []
-    jump = _jump(running, result)
+    jump = splice_jump(running, result)
     if not jump <= JUMP:
         found.append(f"jump of {jump:.1e}")
     softened = FunnelRecovery(result.recovery, replanner.settings.recovery_shares).wall(result.plan)
@@ -128,7 +128,7 @@ def main() -> int:
             if not result.ok:
                 reasons[_words(result.message)] += 1
                 continue
-            worst_jump = max(worst_jump, _jump(plan, result))
+            worst_jump = max(worst_jump, splice_jump(plan, result))
             if found := offences(plan, result, estimate, replanner):
                 offending.append({"replan": done, "kind": kind, "path": str(result.path), "offences": found})
                 print(offending[-1], flush=True)
@@ -160,15 +160,6 @@ def main() -> int:
 def _direction(rng: np.random.Generator) -> np.ndarray:
     heading = rng.uniform(-np.pi, np.pi)
     return np.array([np.cos(heading), np.sin(heading), 0.0])
-
-
-def _jump(running: GraspPlan, result: ReplanResult) -> float:
-    a, b = running.sample(result.splice), result.plan.sample(result.splice)
-    return max(
-        float(np.abs(getattr(getattr(a, part), name) - getattr(getattr(b, part), name)).max())
-        for part in ("arm", "gripper")
-        for name in ("position", "velocity", "acceleration")
-    )
 
 
 def _words(message: str) -> str:

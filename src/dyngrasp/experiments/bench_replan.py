@@ -207,7 +207,7 @@ def _cycle_rows(cell: Cell, cycles: int, seed: int, progress: Callable[[str], No
                     counts["kept"] += result.path is Path.KEPT
                     counts["late"] += result.status is Status.DEADLINE_MISSED
                     counts["published_invalid"] += result.ok and not _valid(result, cell.task)
-                    counts["jumps"] += result.ok and _jump(running, result) > 1e-9
+                    counts["jumps"] += result.ok and splice_jump(running, result) > 1e-9
             progress(f"cycles, {sequence}: {done}")
     return [
         {"solver": "replanner", "case": case, **timing_summary(times), **outcome[case]}
@@ -282,7 +282,8 @@ def _valid(result: ReplanResult, task: GraspTask) -> bool:
     )
 
 
-def _jump(running: GraspPlan, result: ReplanResult) -> float:
+def splice_jump(running: GraspPlan, result: ReplanResult) -> float:
+    """Largest difference of old and new plan at the splice, of arm and hand (rad, rad/s, rad/s²)."""
     a, b = running.sample(result.splice), result.plan.sample(result.splice)
     return max(
         float(np.abs(getattr(getattr(a, part), name) - getattr(getattr(b, part), name)).max())
