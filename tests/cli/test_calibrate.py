@@ -9,9 +9,10 @@ import pinocchio as pin
 import pytest
 
 from dyngrasp.cli import main
-from dyngrasp.cli.arguments import BAD_INPUT, DELIVERED
+from dyngrasp.cli.arguments import BAD_INPUT, DELIVERED, DICTIONARIES
 from dyngrasp.models.camera import camera_toml
 from dyngrasp.models.catalogue import load_camera, load_gripper, load_robot
+from dyngrasp.models.grasp_object import MARKER_DICTIONARIES
 from dyngrasp.perception.calibration import Board
 from dyngrasp.perception.picture_files import png, read_picture
 
@@ -260,3 +261,7 @@ def _replace(folder, old, new):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
+
+
+def test_families_of_markers_are_those_of_the_models():
+    assert DICTIONARIES == tuple(MARKER_DICTIONARIES)

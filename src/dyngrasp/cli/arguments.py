@@ -25,7 +25,8 @@ _POSES = {
         *(f"pose.{key}=0" for key in ("position_mm", "rotation_deg", "along_mm", "across_mm", "up_mm")),
     ),
 }
-_DICTIONARIES = ("4x4_50", "5x5_50", "6x6_50", "apriltag_36h11")
+# As `models.grasp_object.MARKER_DICTIONARIES`, which would be slow to import; a test compares them.
+DICTIONARIES = ("4x4_50", "5x5_50", "6x6_50", "apriltag_36h11")
 _SET = "override a key of the scenario, e.g. --set part.yaw_deg=30; may be repeated"
 
 
@@ -148,7 +149,7 @@ def _add_calibrate(commands: Any) -> None:
         help="edge of a marker; default: 22",
     )  # fmt: skip
     geometry.add_argument(
-        "--dictionary", choices=_DICTIONARIES, default="5x5_50", help="family of the markers; default: 5x5_50"
+        "--dictionary", choices=DICTIONARIES, default="5x5_50", help="family of the markers; default: 5x5_50"
     )
     start = "camera file or name to begin with: size of the pictures, rough focal lengths; default: ava1000"
     size: dict[str, Any] = {

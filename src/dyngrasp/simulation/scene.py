@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dyngrasp.simulation.conveyor import CONVEYOR, Conveyor, ConveyorAddresses, add_conveyor, locate_conveyor
 from dyngrasp.simulation.printed_sheet import PrintedSheet, add_sheet
+from dyngrasp.simulation.stage import set_stage
 from dyngrasp.simulation.variation import PlantVariation
 
 if TYPE_CHECKING:
@@ -128,7 +129,7 @@ def build_scene(
     spec = mujoco.MjSpec()
     spec.modelname = f"{robot.name} with {gripper.name} and {grasp_object.name}"
     _set_numerics(spec, settings)
-    _set_stage(spec, settings)
+    set_stage(spec, GROUND, settings.ground_friction)
     _attach_robot(spec, robot, variation)
     _attach_gripper(spec, robot, gripper)
     _add_part(spec, grasp_object, variation)
@@ -162,57 +163,6 @@ def _set_numerics(spec: MjSpec, settings: SceneSettings) -> None:
     # Inertia comes from the files alone: shapes drawn for the eye must not add any.
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     spec.compiler.degree = False
-
-
-def _set_stage(spec: MjSpec, settings: SceneSettings) -> None:
-    """Ground, light and sky."""
-    spec.stat.center = [0.35, 0.0, 0.45]
-    spec.stat.extent = 1.4
-    visual = spec.visual
-    visual.global_.offwidth, visual.global_.offheight = 1920, 1080
-    visual.quality.shadowsize, visual.quality.offsamples = 2048, 4
-    visual.map.znear, visual.map.zfar = 0.02, 30.0
-    visual.headlight.ambient, visual.headlight.diffuse = [0.32] * 3, [0.28] * 3
-    visual.headlight.specular = [0.05] * 3
-    visual.rgba.haze = [0.80, 0.84, 0.88, 1.0]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.95, 0.96, 0.97],
-        rgb2=[0.72, 0.79, 0.86],
-        width=256,
-        height=1536,
-    )
-    spec.add_texture(
-        name="tiles",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        mark=mujoco.mjtMark.mjMARK_EDGE,
-        rgb1=[0.56, 0.59, 0.62],
-        rgb2=[0.525, 0.555, 0.585],
-        markrgb=[0.47, 0.50, 0.53],
-        width=512,
-        height=512,
-    )
-    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[2.5, 2.5], specular=0.1, shininess=0.1)
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    spec.worldbody.add_geom(
-        name=GROUND,
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0.0, 0.0, 0.05],
-        material="floor",
-        friction=[settings.ground_friction, 0.005, 0.0001],
-    )
-    directional = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    spec.worldbody.add_light(
-        name="key", type=directional, pos=[1.2, -1.4, 2.6], dir=[-0.38, 0.52, -0.85], diffuse=[0.62] * 3,
-        specular=[0.3] * 3, castshadow=True,
-    )  # fmt: skip
-    spec.worldbody.add_light(
-        name="fill", type=directional, pos=[-1.0, 2.0, 2.0], dir=[0.45, -0.70, -0.55], diffuse=[0.22] * 3,
-        specular=[0.05] * 3, castshadow=False,
-    )  # fmt: skip
 
 
 def _attach_robot(spec: MjSpec, robot: RobotModel, variation: PlantVariation) -> None:
