@@ -264,4 +264,4 @@ def _replace(folder, old, new):
 
 
 def test_families_of_markers_are_those_of_the_models():
-    assert DICTIONARIES == tuple(MARKER_DICTIONARIES)
+    assert tuple(MARKER_DICTIONARIES) == DICTIONARIES
