@@ -81,3 +81,27 @@ def collect(
                         codes[count] = ((kind * 2 + side) * K + k) * n + j
                         count += 1
     return count, least
+
+
+@njit(cache=True, error_model="numpy")
+def least_row(z: Array, T: float, T_lin: float, boxes: Array, rates: Array, a_ends: tuple[bool, bool]) -> float:
+    """The least row of all, as `collect` finds it; from the extremes of each joint, where its rows have one bound."""
+    _, K, n = z.shape
+    if rates.shape[1] > 0:
+        return collect(z, T, T_lin, boxes, rates, -np.inf, a_ends, np.empty(0, np.int64))[1]
+    least = np.inf
+    highest, lowest = np.empty(n), np.empty(n)
+    for kind in range(3):
+        first = 0 if kind == 2 and a_ends[0] else 1
+        last = K if kind == 2 and a_ends[1] else K - 1
+        highest[:], lowest[:] = z[kind, first], z[kind, first]
+        for k in range(first + 1, last):
+            for j in range(n):
+                value = z[kind, k, j]
+                highest[j], lowest[j] = max(highest[j], value), min(lowest[j], value)
+        for j in range(n):
+            if kind == 0 or boxes[kind + 1, j] < UNBOUNDED:
+                for sign, extreme in ((1.0, highest[j]), (-1.0, lowest[j])):
+                    b, c, scale = bound(kind, first, j, sign, T_lin, boxes, rates)
+                    least = min(least, (b + c * (T - T_lin) - sign * extreme) * scale)
+    return least

@@ -65,8 +65,8 @@ def interior_point(
         a_ends: See `collect`.
         first: Of `filters`.
         taps: Of `filters`.
-        base: (N−1, 3, n) band of the Hessian of the cost.
-        weights: (3, n) weights of q, w, a in the cost.
+        base: (N−1, 3) band of the Hessian of the cost, the same for every joint.
+        weights: (3,) weights of q, w, a in the cost.
         node_weights: (K,) added to the weight of q at each grid point.
         slope: (3, K, n) how q, w, a change with T at constant x.
         by_T: (3, K, n) how the errors change with T.
@@ -117,20 +117,19 @@ def interior_point(
     for i in range(used):
         s[i] = max(g[i], floor)
         lam[i] = mu / s[i]
-    band, column, solved = np.empty_like(base), np.empty((size, n)), np.empty((size, n))
+    band, column, solved = np.empty((size, 3, n)), np.empty((size, n)), np.empty((size, n))
     gradient, step, dual = np.empty((size, n)), np.empty((size, n)), np.empty_like(z)
     # Steps that z has not followed yet: it is asked for only when rows are looked for.
     ahead, ahead_T = np.zeros((size, n)), 0.0
     k_first, k_last = (0, K) if ends_cost else (1, K - 1)
-    dual[:] = 0.0
     weigh(by_T, weights, node_weights, k_first, k_last, dual)
     corner = stiffness_T + product(dual, by_T)
-    pull_back(first, taps, dual, column)
+    pull_back(taps, dual, column)
     base_column = column.copy()
     # The cost is quadratic: its gradient follows from the steps.
     weigh(error, weights, node_weights, k_first, k_last, dual)
     g_T = gradient_T + product(dual, by_T)
-    pull_back(first, taps, dual, gradient)
+    pull_back(taps, dual, gradient)
     outcome = ITERATION_LIMIT
     iterations = 0
     look_below = LOOK_BELOW
@@ -143,7 +142,7 @@ def interior_point(
         mean /= used
         if mean * used <= look_below * unit:
             look_below = LOOK_BELOW * mean * used / unit
-            _follow(first, taps, slope, ahead, ahead_T, dx, z)
+            _follow(taps, slope, ahead, ahead_T, dx, z)
             ahead_T = 0.0
             count, _ = collect(z, T, T_lin, boxes, rates, LOOK_NEAR, a_ends, found)
             new = rows
@@ -176,7 +175,9 @@ def interior_point(
         if iteration == max_iterations:
             break
         # Newton matrix.
-        band[:] = base
+        for i in range(size):
+            for d in range(3):
+                band[i, d, :] = base[i, d]
         column[:] = base_column
         c_T = corner
         for i in range(used):
@@ -263,23 +264,23 @@ def interior_point(
                 along = length * step[i, j]
                 ahead[i, j] += along
                 g_T += base_column[i, j] * along
-                gradient[i, j] += base[i, 0, j] * along + length * dT * base_column[i, j]
+                gradient[i, j] += base[i, 0] * along + length * dT * base_column[i, j]
                 if i + 1 < size:
-                    gradient[i, j] += base[i, 1, j] * length * step[i + 1, j]
-                    gradient[i + 1, j] += base[i, 1, j] * along
+                    gradient[i, j] += base[i, 1] * length * step[i + 1, j]
+                    gradient[i + 1, j] += base[i, 1] * along
                 if i + 2 < size:
-                    gradient[i, j] += base[i, 2, j] * length * step[i + 2, j]
-                    gradient[i + 2, j] += base[i, 2, j] * along
-    _follow(first, taps, slope, ahead, ahead_T, dx, z)
+                    gradient[i, j] += base[i, 2] * length * step[i + 2, j]
+                    gradient[i + 2, j] += base[i, 2] * along
+    _follow(taps, slope, ahead, ahead_T, dx, z)
     multipliers[:] = 0.0
     multipliers[:used] = lam[:used]
     return outcome, T, iterations, rows
 
 
 @njit(cache=True, error_model="numpy")
-def _follow(first: Indices, taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, z: Array) -> None:
+def _follow(taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, z: Array) -> None:
     """Add steps (N−1, n) of the unknowns, and one of T, to dx and z; the former are zero afterwards."""
-    push_forward(first, taps, ahead, z)
+    push_forward(taps, ahead, z)
     for kind in range(3):
         for k in range(z.shape[1]):
             for j in range(z.shape[2]):

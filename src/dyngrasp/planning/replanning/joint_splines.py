@@ -113,64 +113,110 @@ def sequence(x: Array, values: Array, held: tuple[bool, bool], r: Array) -> None
 
 
 @njit(cache=True, error_model="numpy")
+def plain_taps(kind: int, K: int) -> tuple[float, float, float]:
+    """Weights of r[k−1], r[k], r[k+1] in q, w or a of grid point k of K."""
+    N = float(K - 1)
+    if kind == POSITION:
+        return 0.25, 0.5, 0.25
+    return (-0.5 * N, 0.0, 0.5 * N) if kind == RATE else (N * N, -2.0 * N * N, N * N)
+
+
+@njit(cache=True, error_model="numpy")
 def filtered(r: Array, z: Array) -> None:
     """Write q, w, a (3, N+1, n) of a sequence r (N+3, n)."""
-    _, K, n = z.shape
+    K = z.shape[1]
+    first, second, third = neighbours(r, K)
+    q, w, a = z[0].ravel(), z[1].ravel(), z[2].ravel()
     half_rate, curvature = 0.5 * (K - 1), float((K - 1) * (K - 1))
-    for k in range(K):
-        for j in range(n):
-            before, here, after = r[k, j], r[k + 1, j], r[k + 2, j]
-            z[0, k, j] = 0.25 * (before + after) + 0.5 * here
-            z[1, k, j] = half_rate * (after - before)
-            z[2, k, j] = curvature * ((after - here) - (here - before))
+    for i in range(q.size):
+        before, here, after = first[i], second[i], third[i]
+        q[i] = 0.25 * (before + after) + 0.5 * here
+        w[i] = half_rate * (after - before)
+        a[i] = curvature * ((after - here) - (here - before))
 
 
 @njit(cache=True, error_model="numpy")
-def pull_back(first: Indices, taps: Array, dual: Array, gradient: Array) -> None:
+def neighbours(rows: Array, count: int) -> tuple[Array, Array, Array]:
+    """Views, flat, of `count` rows of an array (M, n) from the first, the second and the third on.
+
+    A loop over such views, all of them from zero, becomes vector instructions; nested ones of seven joints do not.
+    """
+    return rows[:count].ravel(), rows[1 : 1 + count].ravel(), rows[2 : 2 + count].ravel()
+
+
+@njit(cache=True, error_model="numpy")
+def pull_back(taps: Array, dual: Array, gradient: Array) -> None:
     """Overwrite `gradient` (N−1, n) by the derivatives by x of Σ dual · z, `dual` (3, N+1, n)."""
-    _, K, n = dual.shape
     gradient[:] = 0.0
-    for k in range(K):
-        for b in range(TAPS):
-            q, w, a = taps[k, b, 0], taps[k, b, 1], taps[k, b, 2]
-            i = first[k] + b
-            for j in range(n):
-                gradient[i, j] += q * dual[0, k, j] + w * dual[1, k, j] + a * dual[2, k, j]
+    for kind in range(3):
+        pull_back_one(kind, taps, dual[kind], gradient)
 
 
 @njit(cache=True, error_model="numpy")
-def push_forward(first: Indices, taps: Array, dx: Array, z: Array) -> None:
+def pull_back_one(kind: int, taps: Array, dual: Array, gradient: Array) -> None:
+    """Add to `gradient` (N−1, n) the derivatives by x of Σ dual · z[kind], `dual` (N+1, n)."""
+    K, n = dual.shape
+    before, here, after = plain_taps(kind, K)
+    first, second, third = neighbours(dual[1:], K - 4)
+    out = gradient[1 : K - 3].ravel()
+    for i in range(out.size):
+        out[i] += after * first[i] + here * second[i] + before * third[i]
+    for k in range(TAPS):
+        for j in range(n):
+            gradient[0, j] += taps[k, 0, kind] * dual[k, j]
+            gradient[K - 3, j] += taps[K - TAPS + k, TAPS - 1, kind] * dual[K - TAPS + k, j]
+
+
+@njit(cache=True, error_model="numpy")
+def push_forward(taps: Array, dx: Array, z: Array) -> None:
     """Add the change of q, w, a with dx (N−1, n) to z (3, N+1, n)."""
     _, K, n = z.shape
-    for k in range(K):
-        for b in range(TAPS):
-            q, w, a = taps[k, b, 0], taps[k, b, 1], taps[k, b, 2]
-            i = first[k] + b
+    for kind in range(3):
+        before, here, after = plain_taps(kind, K)
+        inner = dx[1 : K - 3].ravel()
+        # What the interior unknowns do, then what the first and the last one do.
+        first, second, third = neighbours(z[kind, 1:], K - 4)
+        for i in range(inner.size):
+            first[i] += after * inner[i]
+        for i in range(inner.size):
+            second[i] += here * inner[i]
+        for i in range(inner.size):
+            third[i] += before * inner[i]
+        for k in range(TAPS):
             for j in range(n):
-                value = dx[i, j]
-                z[0, k, j] += q * value
-                z[1, k, j] += w * value
-                z[2, k, j] += a * value
+                z[kind, k, j] += taps[k, 0, kind] * dx[0, j]
+                z[kind, K - TAPS + k, j] += taps[K - TAPS + k, TAPS - 1, kind] * dx[K - 3, j]
+
+
+@njit(cache=True, error_model="numpy")
+def spread_weights(kind: int, weights: Array, node_weights: Array, k_first: int, k_last: int, out: Array) -> None:
+    """Write the weights of q, w or a at all grid points (N+1, n), zero outside k_first … k_last − 1.
+
+    See `tracking_kernel.solve` for the weights.
+    """
+    out[:] = weights[kind]
+    if kind == POSITION:
+        for k in range(out.shape[0]):
+            if node_weights[k] > 0.0:
+                out[k] += node_weights[k]
+    out[:k_first] = 0.0
+    out[k_last:] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
 def weigh(z: Array, weights: Array, node_weights: Array, k_first: int, k_last: int, dual: Array) -> None:
-    """Write Q z into `dual` (3, N+1, n) at grid points k_first … k_last − 1; weights: see `tracking_kernel.solve`."""
-    for k in range(k_first, k_last):
-        for j in range(z.shape[2]):
-            dual[0, k, j] = (weights[0, j] + node_weights[k]) * z[0, k, j]
-            dual[1, k, j] = weights[1, j] * z[1, k, j]
-            dual[2, k, j] = weights[2, j] * z[2, k, j]
+    """Write Q z into `dual` (3, N+1, n)."""
+    for kind in range(3):
+        spread_weights(kind, weights, node_weights, k_first, k_last, dual[kind])
+        dual[kind] *= z[kind]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def product(a: Array, b: Array) -> float:
-    """Σ a · b over two arrays (3, N+1, n)."""
-    total = 0.0
-    for kind in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            for j in range(a.shape[2]):
-                total += a[kind, k, j] * b[kind, k, j]
+    """Σ a · b over two arrays of one shape; the order of the sum is the compiler's."""
+    total, x, y = 0.0, a.ravel(), b.ravel()
+    for i in range(x.size):
+        total += x[i] * y[i]
     return total
 
 
@@ -210,3 +256,29 @@ def substitute(band: Array, x: Array) -> None:
         if i + 2 < size:
             for j in range(n):
                 x[i, j] -= band[i, 2, j] * x[i + 2, j]
+
+
+@njit(cache=True, error_model="numpy")
+def substitute_shared(band: Array, x: Array) -> None:
+    """`substitute` where one band (N−1, 3) serves all columns of x (N−1, n)."""
+    size, n = x.shape
+    for i in range(size - 1):
+        l1 = band[i, 1]
+        for j in range(n):
+            x[i + 1, j] -= l1 * x[i, j]
+        if i + 2 < size:
+            l2 = band[i, 2]
+            for j in range(n):
+                x[i + 2, j] -= l2 * x[i, j]
+    for i in range(size - 1, -1, -1):
+        inverse = band[i, 0]
+        for j in range(n):
+            x[i, j] *= inverse
+        if i + 1 < size:
+            l1 = band[i, 1]
+            for j in range(n):
+                x[i, j] -= l1 * x[i + 1, j]
+        if i + 2 < size:
+            l2 = band[i, 2]
+            for j in range(n):
+                x[i, j] -= l2 * x[i + 2, j]

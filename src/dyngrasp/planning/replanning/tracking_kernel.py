@@ -5,19 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
+from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect, least_row
 from dyngrasp.planning.replanning.interior_point import INFEASIBLE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
+    POSITION,
+    RATE,
     TAPS,
     Indices,
     boundary,
     factorise,
     filtered,
+    neighbours,
+    plain_taps,
     product,
-    pull_back,
-    push_forward,
+    pull_back_one,
     sequence,
-    substitute,
+    spread_weights,
+    substitute_shared,
     weigh,
 )
 from dyngrasp.signals import Array
@@ -69,7 +73,7 @@ def solve(
         T_ref: ΔT* (s).
         ends: (2, 3, n) position, velocity, acceleration at both ends.
         held: Whether the acceleration is given at the start and at the end.
-        weights: (3, n) Q_q, Q_q̇, Q_v.
+        weights: (3,) Q_q, Q_q̇, Q_v.
         node_weights: (K,) added to Q_q at each grid point.
         duration_weight: Q_ΔT of one grid point.
         ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
@@ -94,106 +98,77 @@ def solve(
     k_first, k_last = (0, K) if ends_cost else (1, K - 1)
     stiffness_T = duration_weight * (k_last - k_first)
 
-    scaled = np.empty((3, n))
-    for j in range(n):
-        scaled[0, j] = weights[0, j]
-        scaled[1, j] = weights[1, j] / T_ref**2
-        scaled[2, j] = weights[2, j] / T_ref**4
-    base = np.empty((size, 3, n))
+    scaled = np.array([weights[0], weights[1] / T_ref**2, weights[2] / T_ref**4])
+    base = np.empty((size, 3))
     for i in range(size):
         for d in range(3):
-            for j in range(n):
-                base[i, d, j] = (
-                    scaled[0, j] * bands[0, i, d] + scaled[1, j] * bands[1, i, d] + scaled[2, j] * bands[2, i, d]
-                )
+            base[i, d] = scaled[0] * bands[0, i, d] + scaled[1] * bands[1, i, d] + scaled[2] * bands[2, i, d]
+    some_node = False
     for k in range(k_first, k_last):
         if node_weights[k] > 0.0:
+            some_node = True
             for b in range(TAPS):
                 for d in range(TAPS - b):
-                    value = node_weights[k] * taps[k, b, 0] * taps[k, b + d, 0]
-                    for j in range(n):
-                        base[first[k] + b, d, j] += value
-    for end in range(2):
-        if held[end]:
-            base[0 if end == 0 else size - 1, 0, :] = 1.0
+                    base[first[k] + b, d] += node_weights[k] * taps[k, b, 0] * taps[k, b + d, 0]
+    if held[0]:
+        base[0, 0] = 1.0
+    if held[1]:
+        base[size - 1, 0] = 1.0
+    # All joints have the same weights, and until one of their rows is active the same matrix.
     band = base.copy()
-    factorise(band)
+    factorise(band.reshape(size, 3, 1))
 
-    x, r, nothing = np.empty((size, n)), np.empty((K + 2, n)), np.zeros((size, n))
-    values, slopes = np.empty((2, 3, n)), np.empty((2, 3, n))
+    x, r, r_by_T = np.empty((size, n)), np.empty((K + 2, n)), np.zeros((K + 2, n))
+    values, slopes, nothing = np.empty((2, 3, n)), np.empty((2, 3, n)), np.zeros((size, n))
     h2 = 1.0 / (K - 1) ** 2
     for i in range(size):
         k = 0 if i == 0 else (K - 1 if i == size - 1 else i + 1)
         for j in range(n):
             x[i, j] = reference[0, k, j] - h2 / 4 * T_ref * T_ref * reference[2, k, j]
 
-    error, by_T, slope, dual = np.empty_like(z), np.empty_like(z), np.empty_like(z), np.zeros_like(z)
+    dual, dual_by_T, weight = np.empty((K, n)), np.empty((K, n)), np.empty((K, n))
     gradient, column, solved = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
     moving_ends = False
     for end in range(2):
         for j in range(n):
             moving_ends = moving_ends or (held[end] and ends[end, 2, j] != 0.0)
-    T_lin, gradient_T = T, 0.0
+    T_lin, dT, gradient_T = T, 0.0, 0.0
     # A given acceleration enters as T² q̈: the program is solved twice, the second time about the T of the first.
     passes = 2 if moving_ends and free_T and not paper_rows else 1
     for _ in range(passes):
         T_lin = T
         boundary(T, T_ref, ends, reference, paper_rows, values, slopes)
         sequence(x, values, held, r)
-        filtered(r, z)
         # The sequence is linear: at constant x it changes with T as it would from slopes at the ends and x = 0.
-        sequence(nothing, slopes, held, r)
-        filtered(r, slope)
-        corner, gradient_T = stiffness_T, stiffness_T * (T - T_ref)
+        sequence(nothing, slopes, held, r_by_T)
+        gradient_T, corner = stiffness_T * (T - T_ref), stiffness_T
         g_T = gradient_T
-        shift = T - T_ref
-        for k in range(K):
-            for j in range(n):
-                w_by_T, a_by_T = reference[1, k, j], 2 * T_ref * reference[2, k, j]
-                by_T[0, k, j] = slope[0, k, j]
-                by_T[1, k, j] = slope[1, k, j] - w_by_T
-                by_T[2, k, j] = slope[2, k, j] - a_by_T
-                error[0, k, j] = z[0, k, j] - reference[0, k, j]
-                error[1, k, j] = z[1, k, j] - T_ref * reference[1, k, j] - w_by_T * shift
-                error[2, k, j] = z[2, k, j] - T_ref * T_ref * reference[2, k, j] - a_by_T * shift
-        weigh(error, scaled, node_weights, k_first, k_last, dual)
-        g_T += product(dual, by_T)
-        pull_back(first, taps, dual, gradient)
+        gradient[:], column[:] = 0.0, 0.0
+        for kind in range(3):
+            if scaled[kind] > 0.0 or (kind == POSITION and some_node):
+                spread_weights(kind, scaled, node_weights, k_first, k_last, weight)
+                by_T, by_TT = _duals(kind, weight, reference[kind], T, T_ref, r, r_by_T, dual, dual_by_T)
+                g_T += by_T
+                corner += by_TT
+                pull_back_one(kind, taps, dual, gradient)
+                if free_T:
+                    pull_back_one(kind, taps, dual_by_T, column)
+        substitute_shared(band, gradient)
         dT = 0.0
         if free_T:
-            weigh(by_T, scaled, node_weights, k_first, k_last, dual)
-            corner += product(dual, by_T)
-            pull_back(first, taps, dual, column)
             solved[:] = column
-            substitute(band, solved)
-            complement = corner
-            dT = -g_T
-            for i in range(size):
-                for j in range(n):
-                    complement -= column[i, j] * solved[i, j]
-                    dT += solved[i, j] * gradient[i, j]
-            dT /= complement
+            substitute_shared(band, solved)
+            dT = (product(column, gradient) - g_T) / (corner - product(column, solved))
             # For given T the rest follows: at a bound of T the program is solved by clipping, for it is convex.
             dT = min(max(dT, duration[0] - T), duration[1] - T)
-        substitute(band, gradient)
-        if free_T:
-            for i in range(size):
-                for j in range(n):
-                    gradient[i, j] += dT * solved[i, j]
-        for i in range(size):
-            for j in range(n):
-                gradient[i, j] = -gradient[i, j]
-                x[i, j] += gradient[i, j]
+            gradient += dT * solved
+        x -= gradient
         T += dT
         gradient_T += stiffness_T * dT
-    # What the last step did to q, w, a, with the row of T² linear as the program has it.
-    for kind in range(3):
-        for k in range(K):
-            for j in range(n):
-                error[kind, k, j] += by_T[kind, k, j] * dT
-                z[kind, k, j] += slope[kind, k, j] * dT
-    push_forward(first, taps, gradient, z)
-    push_forward(first, taps, gradient, error)
+    # The last step with the row of T² linear, as the program has it.
+    values += dT * slopes
+    sequence(x, values, held, r)
+    filtered(r, z)
 
     rates = np.empty((2, K if paper_rows else 0, n))
     if paper_rows:
@@ -201,13 +176,17 @@ def solve(
         rates[1] = 2 * T_ref * reference[2]
         T_lin = T_ref
     a_ends = (not held[0], not held[1])
-    count, least = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
-    iterations, outcome = 0, OPTIMAL
+    least = least_row(z, T, T_lin, boxes, rates, a_ends)
+    iterations, outcome, count = 0, OPTIMAL, 0
     if least < -VIOLATION:
-        weigh(error, scaled, node_weights, k_first, k_last, dual)
-        cost = 0.5 * (stiffness_T * (T - T_ref) ** 2 + product(dual, error))
+        count, _ = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
+        slope, error, by_T, duals = np.empty_like(z), np.empty_like(z), np.empty_like(z), np.zeros_like(z)
+        filtered(r_by_T, slope)
+        _errors(reference, T, T_ref, z, slope, error, by_T)
+        weigh(error, scaled, node_weights, k_first, k_last, duals)
+        cost = 0.5 * (stiffness_T * (T - T_ref) ** 2 + product(duals, error))
         # The cost of moving by what is violated is the scale of a program whose free optimum costs next to nothing.
-        unit = max(cost, 0.5 * (stiffness_T + np.sum(scaled[0])) * least * least, 1e-9)
+        unit = max(cost, 0.5 * (stiffness_T + n * scaled[0]) * least * least, 1e-9)
         x_free, z_free, error_free = x.copy(), z.copy(), error.copy()
         T_free, gradient_free = T, gradient_T
         for attempt in range(3):
@@ -255,10 +234,55 @@ def solve(
         if outcome == OPTIMAL and least < -VIOLATION:
             outcome = INFEASIBLE
     else:
-        count = 0
-        multipliers[:] = 0.0
+        multipliers[:2] = 0.0
     if not paper_rows:
         boundary(T, T_ref, ends, reference, False, values, slopes)
         sequence(x, values, held, r)
         filtered(r, z)
     return outcome, T, iterations, count
+
+
+@njit(cache=True, error_model="numpy")
+def _of_reference(kind: int, T: float, T_ref: float) -> tuple[float, float]:
+    """What q*, q̇* or v* are multiplied by to be compared with q, w, a, and its derivative by T: 1, T, T² about T*."""
+    if kind == POSITION:
+        return 1.0, 0.0
+    return (T, 1.0) if kind == RATE else (T_ref * (2 * T - T_ref), 2 * T_ref)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _duals(
+    kind: int,
+    weight: Array,
+    reference: Array,
+    T: float,
+    T_ref: float,
+    r: Array,
+    r_by_T: Array,
+    dual: Array,
+    dual_by_T: Array,
+) -> tuple[float, float]:
+    """Write the weighted deviations of q, w or a (N+1, n) and their derivatives by T; return those of the cost by T."""
+    K, _ = reference.shape
+    before, here, after = plain_taps(kind, K)
+    factor, factor_by_T = _of_reference(kind, T, T_ref)
+    wanted, weights, out, out_by_T = reference.ravel(), weight.ravel(), dual.ravel(), dual_by_T.ravel()
+    r_0, r_1, r_2 = neighbours(r, K)
+    d_0, d_1, d_2 = neighbours(r_by_T, K)
+    by_T, by_TT = 0.0, 0.0
+    for i in range(wanted.size):
+        value = before * r_0[i] + here * r_1[i] + after * r_2[i] - factor * wanted[i]
+        slope = before * d_0[i] + here * d_1[i] + after * d_2[i] - factor_by_T * wanted[i]
+        out[i], out_by_T[i] = weights[i] * value, weights[i] * slope
+        by_T += weights[i] * value * slope
+        by_TT += weights[i] * slope * slope
+    return by_T, by_TT
+
+
+@njit(cache=True, error_model="numpy")
+def _errors(reference: Array, T: float, T_ref: float, z: Array, slope: Array, error: Array, by_T: Array) -> None:
+    """Write the deviations of q, w, a (3, N+1, n) and their derivatives by T."""
+    for kind in range(3):
+        factor, factor_by_T = _of_reference(kind, T, T_ref)
+        error[kind] = z[kind] - factor * reference[kind]
+        by_T[kind] = slope[kind] - factor_by_T * reference[kind]

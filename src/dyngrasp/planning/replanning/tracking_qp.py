@@ -31,10 +31,9 @@ from dyngrasp.trajectory import Trajectory
 class TrackingWeights:
     """Weights of eq. (14), the same for all grid points.
 
-    With position and rate weights of zero the step is the smoothest one: the correction spreads over the whole
-        horizon and has
-    almost arrived when the hand comes down the funnel. Weight on the position delays it to the end, where the funnel
-    is narrow.
+    With position and rate weights of zero the step is the smoothest one: the correction spreads over the whole horizon
+    and has almost arrived when the hand comes down the funnel. Weight on the position delays it to the end, where the
+    funnel is narrow.
 
     Attributes:
         position: Q_q (1/rad²).
@@ -162,8 +161,7 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
     ends[0], ends[1] = problem.start, problem.end
     held = (problem.hold_start_acceleration, problem.hold_end_acceleration)
     w = problem.weights
-    weights = np.empty((3, n))
-    weights[0], weights[1], weights[2] = w.position, w.velocity, w.acceleration
+    weights = np.array([w.position, w.velocity, w.acceleration])
     boxes = np.empty((4, n))
     boxes[0], boxes[1] = problem.position_lower, problem.position_upper
     boxes[2], boxes[3] = problem.velocity_limit, problem.acceleration_limit
