@@ -44,7 +44,7 @@ def torque_rows(robot: RobotModel, intervals: int, fraction: float = 1.0) -> Nod
             f"{fraction:g} of the torque limit {robot.limits.torque[i]:g} Nm of {robot.joint_names[i]} is less than "
             f"the bound of its Coriolis torque, {robot.limits.coriolis[i]:g} Nm"
         )
-    payload = _at_each(symbolic.payload_vector(robot.payload), intervals)
+    payload = _at_each(intervals + 1, symbolic.payload_vector(robot.payload))
     return NodeConstraint("torque", symbolic.torque(robot), payload, -bound, bound, robot.limits.torque)
 
 
@@ -70,7 +70,7 @@ def funnel(
     """
     points = _points(p_flange_grasp)
     widths = np.array([shape.z_threshold, shape.sigma_x, shape.sigma_y])
-    parameters = np.hstack([points, _frames(T_world_grasp, len(points)), _at_each(widths, len(points) - 1)])
+    parameters = _at_each(len(points), points, _frames(T_world_grasp, len(points)), widths)
 
     def build() -> ca.Function:
         q, v, p = _inputs(robot, 18)
@@ -108,7 +108,7 @@ def grasp_tube(
     """
     points = _points(p_flange_grasp)
     axes = np.asarray(R_flange_grasp, dtype=float).ravel()
-    parameters = np.hstack([points, _at_each(axes, len(points) - 1), _frames(T_world_grasp, len(points))])
+    parameters = _at_each(len(points), points, axes, _frames(T_world_grasp, len(points)))
 
     def build() -> ca.Function:
         q, v, p = _inputs(robot, 24)
@@ -156,8 +156,7 @@ def hold(
     """
     if safety < 1 or not 0 < closing_share < 1:
         raise InvalidProblem(f"safety must be ≥ 1 and the closing share in (0, 1); got {safety}, {closing_share}")
-    grip = [pinch.force, pinch.sliding, pinch.torsional, pinch.width, safety]
-    numbers = np.concatenate([symbolic.payload_vector(part), _frame(T_flange_grasp), grip])
+    grip = _bound(pinch.force, pinch.sliding, pinch.torsional, pinch.width, safety)
     velocity = np.asarray(velocity, dtype=float)
 
     def build() -> ca.Function:
@@ -173,7 +172,7 @@ def hold(
     function = _cached(robot, "hold", build)
     scale = _bound(1 / safety**2, 1 / safety**2, closing_share)
     lower, upper = _bound(-np.inf, -np.inf, -closing_share), _bound(0.0, 0.0, closing_share)
-    parameters = np.hstack([_at_each(numbers, len(velocity) - 1), velocity])
+    parameters = _at_each(len(velocity), symbolic.payload_vector(part), _frame(T_flange_grasp), grip, velocity)
     return NodeConstraint("hold", function, parameters, lower, upper, scale)
 
 
@@ -206,7 +205,7 @@ def above_ground(robot: RobotModel, points: ArrayLike, floor: ArrayLike) -> Node
         return ca.Function("above_ground", [q, v, p], [rows], ["q", "v", "p"], ["g"])
 
     function = _cached(robot, f"above_ground_{count}", build)
-    parameters = np.hstack([_at_each(corners.ravel(), len(floor) - 1), floor])
+    parameters = _at_each(len(floor), corners.ravel(), floor)
     return NodeConstraint(
         "above_ground", function, parameters, np.zeros(count), np.full(count, np.inf), np.full(count, 0.01)
     )
@@ -260,9 +259,9 @@ def _frame(T: pin.SE3) -> Array:
 
 
 def _frames(T: pin.SE3 | Sequence[pin.SE3], count: int) -> Array:
-    """(count, 12) numbers of one frame, or of as many."""
+    """(12,) numbers of one frame, or (count, 12) of as many."""
     if isinstance(T, pin.SE3):
-        return _at_each(_frame(T), count - 1)
+        return _frame(T)
     if len(T) != count:
         raise InvalidProblem(f"one frame for each of the {count} grid points expected, got {len(T)}")
     return np.stack([_frame(each) for each in T])
@@ -275,8 +274,14 @@ def _points(p_flange_grasp: ArrayLike) -> Array:
     return points
 
 
-def _at_each(numbers: Array, intervals: int) -> Array:
-    return np.tile(numbers, (intervals + 1, 1))
+def _at_each(points: int, *parts: Array) -> Array:
+    """Parameters at all grid points, side by side: a part is (k,), the same at each of them, or (points, k)."""
+    parameters = np.empty((points, sum(part.shape[-1] for part in parts)))
+    column = 0
+    for part in parts:
+        parameters[:, column : column + part.shape[-1]] = part
+        column += part.shape[-1]
+    return parameters
 
 
 def _bound(*values: float) -> Array:
