@@ -8,146 +8,28 @@ from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from dyngrasp.errors import GraspRefused, OutOfReach
-from dyngrasp.models.grasp_object import Grasp, GraspObject
-from dyngrasp.models.gripper import GripperModel
-from dyngrasp.models.inverse_kinematics import InverseKinematics, inverse_kinematics_for, joint_velocity
-from dyngrasp.models.pinch import Pinch
-from dyngrasp.models.robot import RobotModel
+from dyngrasp.models.grasp_object import Grasp
+from dyngrasp.models.inverse_kinematics import joint_velocity
+from dyngrasp.planning.grasp_task import GraspTask, TaskSettings
 from dyngrasp.signals import Array, read_only
 
+__all__ = [
+    "BoundaryState",
+    "GraspTargets",
+    "GraspTask",
+    "TaskSettings",
+    "check_grasp",
+    "flange_poses",
+    "grasp_targets",
+    "moved",
+    "ranked_grasp_targets",
+    "swivel_velocity",
+]
+
 GRAVITY = 9.81  # m/s²
-
-
-@dataclass(frozen=True)
-class TaskSettings:
-    """How a part is approached, pinched and lifted.
-
-    Attributes:
-        pregrasp_distance: Height of G above the grasp frame where the approach ends (m; the paper draws about 20 mm).
-        approach_speed: Speed of G along the approach axis at the pre-grasp (m/s).
-        lift_speed: Speed of the closed hand along world z at the end of the grasp (m/s), ≥ 0 by eq. (7).
-        swivel_rate: Least arm-angle rate through both ends of the grasp (rad/s). The reversal from approach to lift
-            would stop every joint at the same instant; a redundant arm keeps moving by this null-space motion.
-        swivel_speed_ratio: Least max-norm of q̇/q̇max that the null-space motion alone must give; raises the swivel
-            rate where the arm's posture makes it slow.
-        grasp_duration_min, grasp_duration_max: Bounds on ΔT_2 (s). Longer reversals overshoot below the grasp
-            frame, and the fingers would clamp there.
-        over_close: How much narrower than the part the planned closed gap is (m), so that contact comes before the
-            lift and the position loop already presses when the force ramp begins.
-        side_clearance_min: Least free gap on either side of the part with the gripper open (m).
-        grip_share: Part of the finger force that the hand presses with; the rest is left to its position loop, which
-            keeps the part from moving sideways.
-        holding_safety: Factor by which the pinch must exceed what the part asks of it (torsion and friction).
-        lateral_tolerance, dip_tolerance: How far G may leave the grasp axis, and pass below the grasp frame, while the
-            hand closes (m).
-        tilt_tolerance: How far the hand may tilt against the grasp frame while it closes (rad).
-        limit_margin: Distance that grasp postures keep from the joint limits (rad).
-        dexterity_min: Least singular value of the Jacobian (translation in m/rad) at a grasp posture.
-    """
-
-    pregrasp_distance: float = 0.020
-    approach_speed: float = 0.05
-    lift_speed: float = 0.03
-    swivel_rate: float = 0.06
-    swivel_speed_ratio: float = 0.03
-    grasp_duration_min: float = 0.5
-    grasp_duration_max: float = 0.8
-    over_close: float = 0.001
-    side_clearance_min: float = 0.010
-    grip_share: float = 0.8
-    holding_safety: float = 2.0
-    lateral_tolerance: float = 0.0015
-    dip_tolerance: float = 0.003
-    tilt_tolerance: float = np.deg2rad(1.0)
-    limit_margin: float = np.deg2rad(5.0)
-    dexterity_min: float = 0.04
-
-
-@dataclass(frozen=True, eq=False)
-class GraspTask:
-    """What is to be done: which arm and gripper take which part, and where to.
-
-    Attributes:
-        robot: The bare arm.
-        gripper: The gripper on its flange.
-        grasp_object: The part.
-        place: (n,) target configuration q_T (rad), reached at rest.
-        settings: How the part is approached, pinched and lifted.
-    """
-
-    robot: RobotModel
-    gripper: GripperModel
-    grasp_object: GraspObject
-    place: Array
-    settings: TaskSettings = field(default_factory=TaskSettings)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "place", read_only(self.place, (self.robot.n,)))
-
-    @cached_property
-    def kinematics(self) -> InverseKinematics:
-        """Inverse kinematics of the arm."""
-        return inverse_kinematics_for(self.robot)
-
-    @cached_property
-    def robot_empty(self) -> RobotModel:
-        """The arm with the open gripper as a rigid payload."""
-        return self._carrying_gripper(self.gripper.open_posture)
-
-    def robot_loaded(self, grasp: Grasp) -> RobotModel:
-        """The arm with the closed gripper and the part in `grasp` as rigid payloads."""
-        if grasp not in self._loaded:
-            closed = self.closed_posture(grasp)
-            T_flange_object = self.T_flange_closed(grasp) * grasp.T_object_grasp.inverse()
-            loaded = self._carrying_gripper(closed).with_payload(T_flange_object.act(self.grasp_object.spatial_inertia))
-            self._loaded[grasp] = loaded
-        return self._loaded[grasp]
-
-    def pinch(self, grasp: Grasp) -> Pinch:
-        """How the hand presses on the part in `grasp`."""
-        friction, force = self.grasp_object.friction, self.settings.grip_share * self.gripper.pinch_force
-        return Pinch(force, friction.sliding, friction.torsional, grasp.width)
-
-    def closed_posture(self, grasp: Grasp) -> Array:
-        """(m,) posture of the gripper around the part, a little narrower than the part so that it presses.
-
-        Raises:
-            GraspRefused: The gripper does not close or open that far.
-        """
-        if grasp.width not in self._closed:
-            posture = self.gripper.posture_for(grasp.width - self.settings.over_close)
-            self._closed[grasp.width] = read_only(posture)
-        return self._closed[grasp.width]
-
-    @cached_property
-    def T_flange_open(self) -> pin.SE3:
-        """The grasp frame in the flange frame with the gripper open."""
-        return self.gripper.T_flange_hand * self.gripper.T_hand_grasp(self.gripper.open_posture)
-
-    def T_flange_closed(self, grasp: Grasp) -> pin.SE3:
-        """The grasp frame in the flange frame with the gripper closed around the part."""
-        closed = self.closed_posture(grasp)
-        if grasp.width not in self._T_flange_closed:
-            self._T_flange_closed[grasp.width] = self.gripper.T_flange_hand * self.gripper.T_hand_grasp(closed)
-        return self._T_flange_closed[grasp.width]
-
-    # Planning asks for these again and again: they change with the grasp alone.
-    @cached_property
-    def _loaded(self) -> dict[Grasp, RobotModel]:
-        return {}
-
-    @cached_property
-    def _closed(self) -> dict[float, Array]:
-        return {}
-
-    @cached_property
-    def _T_flange_closed(self) -> dict[float, pin.SE3]:
-        return {}
-
-    def _carrying_gripper(self, posture: Array) -> RobotModel:
-        return self.robot.with_payload(self.gripper.T_flange_hand.act(self.gripper.inertia(posture)))
 
 
 @dataclass(frozen=True)
@@ -258,27 +140,23 @@ def ranked_grasp_targets(T_world_object: pin.SE3, task: GraspTask, q_start: Arra
     Raises:
         OutOfReach, GraspRefused: As `grasp_targets`, before the first item.
     """
+    q_start = read_only(q_start, (task.robot.n,))
     refusals: list[GraspRefused] = []
     unreachable: list[OutOfReach] = []
-    postures: list[Array] = []
-    grasps: list[Grasp] = []
+    found: list[tuple[Grasp, Array, Array]] = []
     for grasp in task.grasp_object.grasps:
         try:
             check_grasp(grasp, T_world_object, task)
-            postures.append(_grasp_postures(grasp, T_world_object, task))
+            found.append((grasp, *_grasp_postures(grasp, T_world_object, task, q_start)))
         except GraspRefused as refusal:
             refusals.append(refusal)
         except OutOfReach as failure:
             unreachable.append(failure)
-        else:
-            grasps += [grasp] * len(postures[-1])
-    if not grasps:
+    if not found:
         raise unreachable[0] if unreachable else refusals[0]
-    candidates = np.concatenate(postures)
     yielded: list[Array] = []
     failure = None
-    for k in np.argsort(_travel_times(candidates, q_start, task), kind="stable"):
-        q, grasp = candidates[k], grasps[k]
+    for grasp, q in _fastest_first(found):
         if any(np.abs(q - other).max() < _DISTINCT for other in yielded):
             continue
         # Asked only of those that are wanted: it costs more than the rest of the choice.
@@ -292,7 +170,7 @@ def ranked_grasp_targets(T_world_object: pin.SE3, task: GraspTask, q_start: Arra
         yielded.append(q)
         yield targets
     if not yielded:
-        raise failure or _no_posture(grasps[0], task)
+        raise failure or _no_posture(found[0][0], task)
 
 
 # Postures closer than this (rad, max-norm) lead to the same motion; the next candidate should be another one.
@@ -310,15 +188,15 @@ def check_grasp(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> None:
     """
     part, gripper, settings = task.grasp_object, task.gripper, task.settings
     needed = grasp.width + 2 * settings.side_clearance_min
-    if gripper.aperture(gripper.open_posture) < needed:
+    if gripper.max_aperture < needed:
         raise GraspRefused(
-            f"{gripper.name} opens {gripper.aperture(gripper.open_posture) * 1e3:.1f} mm; grasp {grasp.name!r} of "
+            f"{gripper.name} opens {gripper.max_aperture * 1e3:.1f} mm; grasp {grasp.name!r} of "
             f"{part.name} is {grasp.width * 1e3:.1f} mm wide and needs {needed * 1e3:.1f} mm with clearance"
         )
     T_world_grasp = T_world_object * grasp.T_object_grasp
     lever = T_world_object.act(part.centre_of_mass) - T_world_grasp.translation
-    weight = part.mass * np.array([0.0, 0.0, -GRAVITY])
-    moment = abs(float(T_world_grasp.rotation[:, 1] @ pin.skew(lever) @ weight))
+    axis = T_world_grasp.rotation[:, 1]
+    moment = part.mass * GRAVITY * abs(float(axis[0] * lever[1] - axis[1] * lever[0]))
     pinch = task.pinch(grasp)
     capacity = 2 * pinch.torsional * pinch.force
     if capacity < settings.holding_safety * moment:
@@ -342,28 +220,50 @@ def flange_poses(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> tupl
     return T_world_grasp * above * task.T_flange_open.inverse(), T_world_grasp * closed.inverse()
 
 
-def _grasp_postures(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> Array:
-    """(k, n) configurations at the grasp that keep clear of the joint limits, k ≥ 1."""
+def _grasp_postures(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask, q_start: Array) -> tuple[Array, Array]:
+    """(k, n) configurations at the grasp and their travel times (k,) (s), at least one of them finite."""
     limits, margin = task.robot.limits, task.settings.limit_margin
     _, T_world_flange = flange_poses(grasp, T_world_object, task)
     postures = task.kinematics.solutions(T_world_flange)
-    inside = (postures >= limits.position_lower + margin) & (postures <= limits.position_upper - margin)
-    postures = postures[inside.all(axis=1)]
-    if not len(postures):
+    inside = limits.position_lower + margin, limits.position_upper - margin
+    times = _travel_times(postures, *inside, q_start, task.place, 1.0 / limits.velocity)
+    if not np.isfinite(times).any():
         raise _no_posture(grasp, task)
-    return postures
+    return postures, times
+
+
+@njit(cache=True)
+def _travel_times(postures: Array, lower: Array, upper: Array, start: Array, place: Array, pace: Array) -> Array:
+    """(k,) time of the slowest joint at top speed from the start to each posture (k, n) and on to the target (s).
+
+    Infinite for a posture outside the limits; `pace` is 1 / speed.
+    """
+    times = np.empty(len(postures))
+    for k in range(len(postures)):
+        there, on, inside = 0.0, 0.0, True
+        for j in range(postures.shape[1]):
+            q = postures[k, j]
+            inside = inside and lower[j] <= q <= upper[j]
+            there = max(there, abs(q - start[j]) * pace[j])
+            on = max(on, abs(place[j] - q) * pace[j])
+        times[k] = there + on if inside else np.inf
+    return times
+
+
+def _fastest_first(found: list[tuple[Grasp, Array, Array]]) -> Iterator[tuple[Grasp, Array]]:
+    """Grasps with postures in the order of their travel times: most often only the first is asked for."""
+    grasps, postures, times = zip(*found, strict=True)
+    first, left = np.cumsum([0, *(len(some) for some in postures)]), np.concatenate(times)
+    while np.isfinite(left[k := int(left.argmin())]):
+        left[k] = np.inf
+        i = int(np.searchsorted(first, k, side="right")) - 1
+        yield grasps[i], postures[i][k - first[i]]
 
 
 def _no_posture(grasp: Grasp, task: GraspTask) -> OutOfReach:
     margin = np.rad2deg(task.settings.limit_margin)
     reason = f"no posture keeps {margin:.0f}° from the joint limits and clear of singularities"
     return OutOfReach(f"grasp {grasp.name!r} of {task.grasp_object.name}", 0.0, reason)
-
-
-def _travel_times(postures: Array, q_start: Array, task: GraspTask) -> Array:
-    """(k,) time of the slowest joint at top speed from the start to each posture (k, n) and on to the target (s)."""
-    speed = task.robot.limits.velocity
-    return (np.abs(postures - q_start) / speed).max(axis=1) + (np.abs(task.place - postures) / speed).max(axis=1)
 
 
 def _targets_at(q: Array, grasp: Grasp, T_world_object: pin.SE3, task: GraspTask, q_start: Array) -> GraspTargets:
