@@ -45,7 +45,7 @@ trial = draw_trial(workcell, seed=1)
 planner = planner_for(workcell)
 planned = plan_trial(workcell, trial, planner)
 
-source = TrackingCamera(trial.T_world_object_believed, seed=1)
+source = TrackingCamera(planned.targets.T_world_object, seed=1)
 executed = execute_trial(workcell, trial, planned, planner=planner, source=source)
 
 published = [event for event in executed.replans if event.result.ok]
@@ -53,7 +53,7 @@ print(
     f"{len(published)} plans replaced the first one; {len(executed.not_taken)} poses were too uncertain to be followed"
 )
 before, after = (
-    T.actInv(trial.T_world_object) for T in (trial.T_world_object_believed, executed.targets.T_world_object)
+    T.actInv(trial.T_world_object) for T in (planned.targets.T_world_object, executed.targets.T_world_object)
 )
 for name, error in (("at first", before), ("in the end", after)):
     print(f"pose error {name}: {1e3 * np.linalg.norm(error.translation):.1f} mm")

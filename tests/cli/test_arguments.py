@@ -33,7 +33,7 @@ def test_the_truth_has_no_errors():
 
 
 def test_noise_keeps_the_errors():
-    noisy = scenario("camera_sdh2.toml", "--pose", "noise")
+    noisy = scenario("replan_20mm.toml", "--pose", "noise")
     assert (noisy.pose.source, noisy.pose.position_mm) == ("noise", 20.0)
 
 

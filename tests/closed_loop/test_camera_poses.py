@@ -133,7 +133,8 @@ def test_what_is_not_seen_stays_as_it_was_believed(stage):
 
 
 def test_pictures_end_where_nobody_asks_any_more(stage):
-    poses = stage.poses(until=0.05)
+    poses = stage.poses()
+    poses.until = 0.05
     stage.run(poses, 0.2)
     assert len(poses.tracker.reports) == 2
 
@@ -172,17 +173,28 @@ def test_the_paper_from_pictures(stage, name, replanning):
     from dyngrasp.experiments.draws import draw_trial
     from dyngrasp.experiments.scenario import load_scenario
     from dyngrasp.experiments.trial import execute_trial, plan_trial, planner_for
+    from dyngrasp.experiments.trial_world import first_look, trial_world
     from dyngrasp.experiments.workcell import load_workcell
 
     file = SCENARIOS / f"{name}.toml"
     workcell = load_workcell(load_scenario(file, [f"replanner.enabled={str(replanning).lower()}"]), file)
     planner = planner_for(workcell)
     trial = draw_trial(workcell, 1)
-    executed = execute_trial(workcell, trial, plan_trial(workcell, trial, planner), planner=planner)
-    # 20 mm beside the part the fingers push it; with pictures they do not. A part on a belt is met as well.
-    assert executed.outcome.success is replanning
-    assert (executed.vision is not None) is replanning
-    if executed.vision is not None:
+    with trial_world(workcell, trial) as world:
+        look = first_look(workcell, world)
+        planned = plan_trial(workcell, trial, planner, look)
+        executed = execute_trial(workcell, trial, planned, planner=planner, world=world)
+    assert look is not None
+    assert executed.outcome.success, executed.outcome.cause
+    # The record begins with the look, the first plan after it.
+    assert executed.record.t[0] == 0.0
+    assert planned.result.require().start_time == look.start_time > 0.2
+    assert executed.vision is not None
+    captures = [report.frame.t_capture for report in executed.vision.reports]
+    # One filter through look and motion: no picture is missing between them. Without replanning nobody looks later.
+    np.testing.assert_allclose(np.diff(captures), 1 / 30, atol=1.001e-3)
+    assert (captures[-1] > look.start_time) is replanning
+    if replanning:
         before = [r for r in executed.vision.reports if r.frame.t_receipt < executed.plan.phase_ends[0]]
         assert before[-1].estimate is not None
         twist = before[-1].estimate.twist_world

@@ -76,4 +76,5 @@ def test_an_error_leaves_part_and_plant_where_they_were():
 def test_the_true_pose_is_the_true_pose():
     cell = workcell("pose.source=truth", "pose.position_mm=0.0", "pose.rotation_deg=0.0")
     trial = draw_trial(cell, 11)
+    assert trial.T_world_object_believed is not None
     np.testing.assert_allclose(trial.T_world_object_believed.homogeneous, trial.T_world_object.homogeneous, atol=1e-15)

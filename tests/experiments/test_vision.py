@@ -11,7 +11,7 @@ from dyngrasp.experiments.draws import draw_trial
 from dyngrasp.experiments.replanning import pose_source, replanning_loop
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.experiments.trial import plan_trial, planner_for
-from dyngrasp.experiments.vision import films, tracker_settings
+from dyngrasp.experiments.vision import tracker_settings
 from dyngrasp.experiments.workcell import load_workcell
 from dyngrasp.perception.pose_track import MotionSettings
 from dyngrasp.signals import PoseEstimate
@@ -92,12 +92,6 @@ def test_the_bound_is_a_setting_and_judges_sources_with_a_covariance_of_their_ow
     noisy = replanning_loop(cell, trial, plan, targets, planner)
     assert noisy is not None
     assert noisy.settings.largest_deviation == np.inf
-
-
-def test_pictures_are_taken_for_a_replanner_only():
-    assert films(workcell("camera_sdh2.toml"))
-    assert not films(workcell("camera_sdh2.toml", "replanner.enabled=false"))
-    assert not films(workcell("replan_20mm.toml"))
 
 
 def test_the_camera_has_the_size_that_the_scenario_asks_for():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,22 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from dyngrasp.cli.arguments import DELIVERED, NOT_DELIVERED
+from dyngrasp.closed_loop.first_look import FirstLook
 from dyngrasp.closed_loop.vision_record import VisionRecord
 from dyngrasp.errors import RenderingUnavailable
 from dyngrasp.experiments.draws import Trial, draw_trial
 from dyngrasp.experiments.output import OutputFolder, atomic, check_writable, write_json
 from dyngrasp.experiments.scenario import load_scenario
-from dyngrasp.experiments.trial import ExecutedTrial, PlannedTrial, execute_trial, plan_trial, planner_for, summary
+from dyngrasp.experiments.trial import (
+    ExecutedTrial,
+    PlannedTrial,
+    episode_meta,
+    execute_trial,
+    plan_trial,
+    planner_for,
+)
+from dyngrasp.experiments.trial_summary import summary
+from dyngrasp.experiments.trial_world import TrialWorld, first_look, trial_world
 from dyngrasp.experiments.vision_files import write_pictures
 from dyngrasp.experiments.workcell import Workcell, load_workcell
 from dyngrasp.report.summary import run_table
@@ -31,14 +42,9 @@ def run(options: argparse.Namespace) -> int:
     folder = options.out or Path("out") / workcell.scenario.name
     with OutputFolder(folder) as out:
         _announce(console, workcell, trial)
-        planned = _plan(console, workcell, trial)
-        executed = None
-        if planned.result.ok:
-            plan = planned.result.require()
-            with _bar(console, "physics", plan.end_time) as advance:
-                executed = execute_trial(workcell, trial, planned, lambda t, phase: advance(t, f"physics: {phase}"))
-        document = summary(trial, planned, executed)
-        _write(console, workcell, planned, executed, document, out, options.video)
+        done = _carry_out(console, workcell, trial)
+        document = summary(workcell, trial, done.look, done.planned, done.executed, done.vision)
+        _write(console, workcell, done, document, out, options.video)
         console.print()
         console.print(run_table(document))
         console.print()
@@ -55,15 +61,55 @@ def plan(options: argparse.Namespace) -> int:
     workcell, trial = _prepare(options)
     check_writable(options.out)
     _announce(console, workcell, trial)
-    planned = _plan(console, workcell, trial)
-    if not planned.result.ok:
-        console.print(f"[bold red]no valid plan[/]: {escape(planned.result.message)}")
+    with trial_world(workcell, trial) as world:
+        look = _look(console, workcell, world)
+    planned = _plan(console, workcell, trial, look) if _found(look) else None
+    document = summary(workcell, trial, look, planned, None, world.vision())
+    if planned is None or not planned.result.ok:
+        console.print(f"[bold red]no valid plan[/]: {escape(document['cause'])}")
         return NOT_DELIVERED
     with atomic(options.out) as temporary:
         planned.result.require().save(temporary)
-    console.print(run_table(summary(trial, planned, None)))
+    console.print(run_table(document))
     console.print(f"plan in {escape(str(options.out))}")
     return DELIVERED
+
+
+@dataclass(frozen=True)
+class _Done:
+    """What a trial got to: the first look, a plan, an execution; and what the camera saw on the way."""
+
+    look: FirstLook | None
+    planned: PlannedTrial | None
+    executed: ExecutedTrial | None
+    vision: VisionRecord | None
+
+
+def _carry_out(console: Console, workcell: Workcell, trial: Trial) -> _Done:
+    with trial_world(workcell, trial) as world:
+        look = _look(console, workcell, world)
+        planned = executed = None
+        if _found(look):
+            planned = _plan(console, workcell, trial, look)
+        if planned is not None and planned.result.ok:
+            with _bar(console, "physics", planned.result.require().end_time) as advance:
+                executed = execute_trial(
+                    workcell, trial, planned, lambda t, phase: advance(t, f"physics: {phase}"), world=world
+                )
+        return _Done(look, planned, executed, world.vision(episode_meta(workcell, trial)))
+
+
+def _look(console: Console, workcell: Workcell, world: TrialWorld) -> FirstLook | None:
+    with _bar(console, "first look", workcell.scenario.camera.look_s) as advance:
+        look = first_look(workcell, world, lambda t, label: advance(t, f"physics: {label}"))
+    if look is not None and look.estimate is not None:
+        console.print(f"part found in {look.ended - look.began:.2f} s, known to ± {1e3 * look.deviation:.1f} mm")
+    return look
+
+
+def _found(look: FirstLook | None) -> bool:
+    """Whether there is something to plan for: what a look found, or, without one, what the trial is told."""
+    return look is None or look.estimate is not None
 
 
 def _prepare(options: argparse.Namespace) -> tuple[Workcell, Trial]:
@@ -82,14 +128,14 @@ def _announce(console: Console, workcell: Workcell, trial: Trial) -> None:
     console.print(f"part at x {x:.3f} m, y {y:.3f} m, yaw {yaw:.0f}°; seed {trial.seed}")
 
 
-def _plan(console: Console, workcell: Workcell, trial: Trial) -> PlannedTrial:
+def _plan(console: Console, workcell: Workcell, trial: Trial, look: FirstLook | None) -> PlannedTrial:
     planner = planner_for(workcell)
     with console.status("planning"):
-        first = plan_trial(workcell, trial, planner)
+        first = plan_trial(workcell, trial, planner, look)
         if not first.result.ok:
             return first
         # The first plan of a process loads compiled code. What planning takes is what it takes from then on.
-        planned = plan_trial(workcell, trial, planner)
+        planned = plan_trial(workcell, trial, planner, look)
     console.print(
         f"planned in {planned.planning_ms:.1f} ms (the first time, with compiled code to load, {first.planning_ms:.0f} "
         "ms); every constraint of the audit holds"
@@ -97,25 +143,18 @@ def _plan(console: Console, workcell: Workcell, trial: Trial) -> PlannedTrial:
     return planned
 
 
-def _write(
-    console: Console,
-    workcell: Workcell,
-    planned: PlannedTrial,
-    executed: ExecutedTrial | None,
-    document: dict,
-    out: OutputFolder,
-    video: bool,
-) -> None:
+def _write(console: Console, workcell: Workcell, done: _Done, document: dict, out: OutputFolder, video: bool) -> None:
     write_json(out / "summary.json", document)
-    if planned.result.plan is not None:
+    planned, executed = done.planned, done.executed
+    if planned is not None and planned.result.plan is not None:
         with atomic(out / "plan.json") as temporary:
             planned.result.plan.save(temporary)
-    if executed is None:
+    if done.vision is not None:
+        _vision(console, done.vision, out)
+    if planned is None or executed is None:
         return
     with atomic(out / "record.npz") as temporary:
         executed.record.save(temporary)
-    if executed.vision is not None:
-        _vision(console, executed.vision, out)
     _figure(workcell, planned, executed, document, out)
     if video and workcell.scenario.render.video:
         _video(console, workcell, executed, out)

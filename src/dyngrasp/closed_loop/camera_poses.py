@@ -27,14 +27,13 @@ class CameraPosesSettings:
     Attributes:
         latency: From the end of the exposure to the pose in the filter (s): transfer and detection.
         exposures: Moments of one exposure that are drawn and averaged; 1 takes its middle alone, without motion blur.
-        start, until: First and last time at which the shutter opens (s): after the grasp nobody asks for pictures.
+        start: When the shutter first opens (s).
         keep_every: Of so many pictures the first is kept; 0 keeps none.
     """
 
     latency: float = 0.012
     exposures: int = 1
     start: float = 0.0
-    until: float = np.inf
     keep_every: int = 0
 
     def __post_init__(self) -> None:
@@ -64,6 +63,8 @@ class CameraPoses:
         """
         self.settings = settings or CameraPosesSettings()
         self.tracker = tracker
+        self.until = np.inf
+        """Last time at which the shutter opens (s): after the grasp nobody asks for pictures."""
         self.pictures: dict[int, Picture] = {}
         """Pictures that were kept, by their number in the order of capture."""
         self._sensor, self._detector = sensor, detector
@@ -84,7 +85,7 @@ class CameraPoses:
             arm_position: (n,) what the encoders read (rad).
         """
         self.tracker.receive(t)
-        if t < self._opens - 1e-9 or (not self._exposure and t > self.settings.until):
+        if t < self._opens - 1e-9 or (not self._exposure and t > self.until):
             return
         self._exposure.append((t, state, arm_position))
         # Sums of rounded periods: half a microsecond is none.
@@ -93,7 +94,11 @@ class CameraPoses:
             self._opens += 1.0 / self._sensor.camera.rate
 
     def estimate(self, truth: Truth, t: float) -> PoseEstimate:
-        """What the filter knows at time t (s) from the pictures that have arrived by then."""
+        """What the filter knows at time t (s) from the pictures that have arrived by then.
+
+        Raises:
+            PoseUnknown: Too few of them showed the part.
+        """
         return self.tracker.estimate(t)
 
     def finish(self, meta: dict[str, Any] | None = None) -> VisionRecord:

@@ -15,8 +15,8 @@ from dyngrasp.control.gripper_control import GripperController, GripperControlSe
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.planning.grasp_targets import GraspTask
-from dyngrasp.simulation.plant import TruthfulPlant
-from dyngrasp.trajectory import GraspPlan
+from dyngrasp.simulation.plant import Truth, TruthfulPlant
+from dyngrasp.trajectory import GraspPlan, PlanSample
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ def run_episode(
     settings: EpisodeSettings | None = None,
     *,
     replanning: ReplanningLoop | None = None,
+    recorder: Recorder | None = None,
     progress: Callable[[float, str], None] | None = None,
     meta: dict[str, Any] | None = None,
 ) -> EpisodeRecord:
@@ -81,6 +82,7 @@ def run_episode(
         controller: Turns both into torques.
         settings: Rates.
         replanning: Replaces the plan as the pose of the part becomes known; begins with the same plan.
+        recorder: Goes on with a record that has begun already, with a first look.
         progress: Called at every recorded sample with the time (s) and the name of the phase.
         meta: Kept with the record.
 
@@ -98,26 +100,41 @@ def run_episode(
         replan_rate=rate,
         record_rate=settings.record_rate,
     )
-    recorder = Recorder(plan.arm_joints, plan.gripper_joints, settings.control_period)
+    recorder = recorder or Recorder(plan.arm_joints, plan.gripper_joints, settings.control_period)
     for tick in clock:
-        observed = plant.observe()
-        if abs(observed.t - tick.t) > settings.control_period / 2:
+        if abs(plant.t - tick.t) > settings.control_period / 2:
             raise InvalidProblem(
-                f"episode: the plant is at {observed.t:.6f} s, the clock at {tick.t:.6f} s; the plant's step must be "
+                f"episode: the plant is at {plant.t:.6f} s, the clock at {tick.t:.6f} s; the plant's step must be "
                 f"the control period of {settings.control_period:g} s and its start that of the plan"
             )
-        truth, state = plant.truth(), plant.state
+        truth = plant.truth()
         if replanning is not None:
             plan = replanning.plan_at(tick.t, tick.replan, truth)
             if tick.t >= replanning.newest.end_time + settings.hold_time:
                 break
         sample = plan.sample(tick.t)
-        command = controller.command(observed, sample)
-        recorder.watch(observed, truth)
-        plant.step(command)
-        if tick.record:
-            applied = plant.applied
-            recorder.sample(observed, truth, sample, command, applied, state)
-            if progress is not None:
-                progress(tick.t, sample.phase)
+        run_period(plant, controller, recorder, sample, truth, tick.record)
+        if tick.record and progress is not None:
+            progress(tick.t, sample.phase)
     return recorder.finish(meta)
+
+
+def run_period(
+    plant: TruthfulPlant, controller: Controller, recorder: Recorder, sample: PlanSample, truth: Truth, record: bool
+) -> None:
+    """Follow a sample of a plan for one control period and watch what happens.
+
+    Args:
+        plant: Steps by a control period.
+        controller: Sees what the plant's sensors read, and the sample.
+        recorder: Watches, and keeps this instant if `record`.
+        sample: What is asked for now.
+        truth: State of the plant now, for the record.
+        record: Whether a sample of the record is due.
+    """
+    observed, state = plant.observe(), plant.state
+    command = controller.command(observed, sample)
+    recorder.watch(observed, truth)
+    plant.step(command)
+    if record:
+        recorder.sample(observed, truth, sample, command, plant.applied, state)

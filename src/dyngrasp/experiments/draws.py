@@ -27,15 +27,15 @@ class Trial:
     Attributes:
         seed: Reproduces it.
         T_world_object: Where the part is.
-        T_world_object_believed: Where the planner is told that it is.
+        T_world_object_believed: Where the planner is told that it is; None if the camera has to find it.
         variation: What the planner does not know about the plant.
         twist_world: (6,) velocity of the part (m/s, rad/s), world axes.
-        twist_believed: (6,) what the planner is told of it.
+        twist_believed: (6,) what the planner is told of it, if it is told anything.
     """
 
     seed: int
     T_world_object: pin.SE3
-    T_world_object_believed: pin.SE3
+    T_world_object_believed: pin.SE3 | None
     variation: PlantVariation
     twist_world: Array
     twist_believed: Array
@@ -87,8 +87,12 @@ def _twists(section: ConveyorSection | None, rng: np.random.Generator) -> tuple[
     return true, (1.0 + section.speed_error * rng.uniform(-1.0, 1.0)) * true
 
 
-def _believed(T_world_object: pin.SE3, part: GraspObject, pose: PoseSection, rng: np.random.Generator) -> pin.SE3:
+def _believed(
+    T_world_object: pin.SE3, part: GraspObject, pose: PoseSection, rng: np.random.Generator
+) -> pin.SE3 | None:
     """The true pose, displaced in the grasp frame: what the fingers feel, wherever the part's origin lies."""
+    if pose.source == "camera":
+        return None
     # All draws are made whatever the settings: those of one setting must not shift the others'.
     signs = rng.choice([-1.0, 1.0], 3)
     offset = 1e-3 * np.array([pose.along_mm, pose.across_mm, pose.up_mm]) * (signs if pose.random_sign else 1.0)

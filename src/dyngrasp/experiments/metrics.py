@@ -104,6 +104,7 @@ def judge(
     record: EpisodeRecord,
     task: GraspTask,
     grasp: Grasp,
+    began: float | None = None,
     limits: SuccessLimits | None = None,
 ) -> Outcome:
     """Judge an episode.
@@ -113,9 +114,11 @@ def judge(
         record: What happened.
         task: Arm, gripper, part.
         grasp: The grasp that the plan takes.
+        began: When the motion began (s); the record's first time if left out.
         limits: Where criteria turn.
     """
     limits = limits or SuccessLimits()
+    began = float(record.t[0]) if began is None else began
     worst = _worst_ratios(record, task)
     slip, details = _slip(plan, record, grasp, limits)
     criteria = (
@@ -126,9 +129,9 @@ def judge(
         slip,
         _placed(plan, record, task, grasp, limits),
         _within_limits(worst, float(record.t[-1])),
-        _moving(plan, record, task, limits),
+        _moving(plan, record, task, limits, began),
     )
-    return Outcome(criteria, worst, {**details, **_tracking(plan, record)})
+    return Outcome(criteria, worst, {**details, **_tracking(plan, record, began)})
 
 
 def _clear(record: EpisodeRecord) -> Criterion:
@@ -247,11 +250,10 @@ def _within_limits(worst: dict[str, float], t: float) -> Criterion:
     )
 
 
-def _moving(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, limits: SuccessLimits) -> Criterion:
+def _moving(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, limits: SuccessLimits, began: float) -> Criterion:
     # A plan that took over during the motion begins later than the motion.
-    start = float(record.t[0])
-    span = plan.end_time - start
-    low, high = (start + share * span for share in limits.speed_window)
+    span = plan.end_time - began
+    low, high = (began + share * span for share in limits.speed_window)
     window = (record.t >= low) & (record.t <= high)
     ratio = (np.abs(record.arm_velocity[window]) / task.robot.limits.velocity).max(axis=1)
     slowest = float(ratio.min())
@@ -265,9 +267,10 @@ def _moving(plan: GraspPlan, record: EpisodeRecord, task: GraspTask, limits: Suc
     )
 
 
-def _tracking(plan: GraspPlan, record: EpisodeRecord) -> dict[str, float]:
-    error = np.abs(record.arm_planned - record.arm_measured)
-    at_grasp = record.index_at(plan.phase_ends[1])
+def _tracking(plan: GraspPlan, record: EpisodeRecord, began: float) -> dict[str, float]:
+    first = record.index_at(began)
+    error = np.abs(record.arm_planned - record.arm_measured)[first:]
+    at_grasp = record.index_at(plan.phase_ends[1]) - first
     return {
         "tracking_rms_rad": float(np.sqrt((error**2).mean())),
         "tracking_max_rad": float(error.max()),

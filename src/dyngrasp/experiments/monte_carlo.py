@@ -20,7 +20,8 @@ from dyngrasp.experiments.draws import draw_trial, trial_seed
 from dyngrasp.experiments.output import atomic
 from dyngrasp.experiments.scenario import Scenario
 from dyngrasp.experiments.statistics import Proportion, timing_summary, wilson
-from dyngrasp.experiments.trial import planner_for, study_row
+from dyngrasp.experiments.trial import planner_for
+from dyngrasp.experiments.trial_summary import study_row
 from dyngrasp.experiments.workcell import load_workcell
 from dyngrasp.models.model_file import decode
 
@@ -53,7 +54,8 @@ _COLUMNS = {
     },
     **dict.fromkeys(("tracking_rms_rad", "tracking_max_rad", "tracking_at_grasp_rad", "clamp_delay_s"), pa.float64()),
     "slip_from_grasp_point_mm": pa.float64(),
-    **dict.fromkeys(("replans", "published", "too_uncertain"), pa.int64()),
+    **dict.fromkeys(("replans", "published", "too_uncertain", "look_frames"), pa.int64()),
+    **dict.fromkeys(("look_s", "look_deviation_mm"), pa.float64()),
 }
 SCHEMA = pa.schema(list(_COLUMNS.items()))
 """Columns of a study's table; what a trial did not get to is null."""

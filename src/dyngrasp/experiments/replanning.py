@@ -74,6 +74,7 @@ def pose_source(section: PoseSection, trial: Trial, grasp: Grasp) -> PoseSource:
     moving = section.motion != "still"
     if section.source == "truth":
         return TruePoses(moving)
+    assert trial.T_world_object_believed is not None  # a camera is a source of its own
     T_object_grasp = grasp.T_object_grasp
     error = (trial.T_world_object * T_object_grasp).actInv(trial.T_world_object_believed * T_object_grasp)
     settings = PoseNoiseSettings(

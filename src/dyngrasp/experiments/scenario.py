@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, create_model, model_validator
+from pydantic import Field, model_validator
 
 from dyngrasp.errors import ModelFileError, ScenarioError
+from dyngrasp.experiments.scenario_values import (
+    Coordinate,
+    Degrees,
+    PositiveRange,
+    Range,
+    Spread,
+    Yaw,
+    settings_schema,
+)
 from dyngrasp.models.model_file import Finite, NonNegative, StrictSchema, decode, read_toml
 from dyngrasp.planning.grasp_targets import TaskSettings
 
 __all__ = [
     "CameraSection",
     "ConveyorSection",
-    "Range",
     "Scenario",
     "PartSection",
     "PlannerSection",
@@ -33,60 +40,6 @@ OVERRIDE = "--set"
 """What errors name in place of a file when the offending value came from an override."""
 
 _MODEL_KEYS = {"task": ("robot", "gripper", "object"), "camera": ("model",)}
-
-
-def _as_range(value: Any) -> Any:
-    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
-
-
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
-        raise ValueError(f"a number or [low, high] with low ≤ high; {value[0]:g} > {value[1]:g}")
-    return value
-
-
-def _positive(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] <= 0:
-        raise ValueError(f"a number > 0 or [low, high] with 0 < low ≤ high, got {value[0]:g}")
-    return value
-
-
-def _within_reach_of_any_arm(value: tuple[float, float]) -> tuple[float, float]:
-    # Catches millimetres where metres belong; whether this arm reaches that far is for the planner to say.
-    if max(abs(value[0]), abs(value[1])) > 10.0:
-        raise ValueError("metres, at most 10 from the base")
-    return value
-
-
-def _whole_turns(value: Any) -> Any:
-    return (-180.0, 180.0) if value == "any" else _as_range(value)
-
-
-Range = Annotated[tuple[Finite, Finite], BeforeValidator(_as_range), AfterValidator(_ordered)]
-"""A number, or [low, high] from which each trial draws uniformly."""
-PositiveRange = Annotated[Range, AfterValidator(_positive)]
-Coordinate = Annotated[Range, AfterValidator(_within_reach_of_any_arm)]
-Yaw = Annotated[tuple[Finite, Finite], BeforeValidator(_whole_turns), AfterValidator(_ordered)]
-Degrees = Annotated[float, Field(ge=-360.0, le=360.0, allow_inf_nan=False)]
-Spread = Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)]
-
-
-def settings_schema(settings: type, *, leave_out: tuple[str, ...] = ()) -> type[StrictSchema]:
-    """The strict schema of a settings dataclass: the same keys, units and defaults, every number finite and ≥ 0.
-
-    Args:
-        settings: A frozen dataclass whose fields are numbers, Booleans and strings with defaults.
-        leave_out: Fields that the scenario sets elsewhere.
-    """
-    kinds: dict[type, Any] = {float: NonNegative, int: Annotated[int, Field(ge=0)], bool: bool, str: str}
-    fields: dict[str, Any] = {}
-    for item in dataclasses.fields(settings):
-        # numpy scalars appear as defaults that were computed, such as deg2rad(1)
-        default: Any = item.default
-        default = default.item() if hasattr(default, "item") else default
-        if item.name not in leave_out and type(default) in kinds:
-            fields[item.name] = (kinds[type(default)], default)
-    return create_model(f"{settings.__name__}Section", __base__=StrictSchema, **fields)
 
 
 _TaskSettingsSection = settings_schema(TaskSettings)
@@ -153,9 +106,10 @@ class PoseSection(StrictSchema):
     their signs. With `draw = "planar"` the error is exactly `position_mm` in a random horizontal direction and exactly
     `rotation_deg` about the vertical, to either side.
 
-    With `source = "camera"` the first pose is off in the same way, and then the replanner is told what the table
-    `[camera]` sees. `motion` says what is known of the part beforehand: whether its velocity is estimated at all. The
-    remaining keys are for `"noise"`: what a camera would reveal, see `PoseNoiseSettings`; their defaults are fitted to
+    With `source = "camera"` nothing is known at first: the arm waits where the motion starts while the camera of the
+    table `[camera]` takes a first look, the grasp is planned for what it saw, and pictures tell the replanner the rest.
+    `motion` says what is known of the part beforehand: whether its velocity is estimated at all. All other keys are for
+    `"noise"`, the last of them for what a camera would reveal, see `PoseNoiseSettings`; their defaults are fitted to
     the rendered camera.
     """
 
@@ -194,8 +148,9 @@ class CameraSection(StrictSchema):
 
     Without `width` and `height` they are as large as the camera's own. `exposures` moments of each exposure are drawn
     and averaged, which is its motion blur. `latency_ms` is from the end of the exposure to the pose in the filter. Each
-    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction. `dyngrasp run`
-    keeps one picture of `keep_every`; 0 keeps none.
+    trial draws an error of the calibrated mount, of `mount_mm` and `mount_deg` in a random direction. The first look,
+    taken from `task.start_deg`, ends when the grasp point is known to `look_mm` (one standard deviation) and
+    `look_least_s` have passed, or after `look_s`. `dyngrasp run` keeps one picture of `keep_every`; 0 keeps none.
     """
 
     model: str = "ava1000"
@@ -208,14 +163,17 @@ class CameraSection(StrictSchema):
     vignetting: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
     mount_mm: NonNegative = 0.0
     mount_deg: NonNegative = 0.0
-    prior_mm: Annotated[float, Field(gt=0.0)] = 30.0
-    prior_deg: Annotated[float, Field(gt=0.0)] = 10.0
+    look_mm: Annotated[float, Field(gt=0.0)] = 2.0
+    look_least_s: NonNegative = 0.0
+    look_s: Annotated[float, Field(gt=0.0, le=60.0)] = 2.0
     keep_every: Annotated[int, Field(ge=0)] = 3
 
     @model_validator(mode="after")
-    def _both_sides(self) -> Self:
+    def _consistent(self) -> Self:
         if (self.width is None) != (self.height is None):
             raise ValueError("width and height: both or neither")
+        if self.look_least_s > self.look_s:
+            raise ValueError("look_least_s: at most look_s")
         return self
 
 

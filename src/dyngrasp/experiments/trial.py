@@ -1,4 +1,4 @@
-"""One trial from draw to verdict: targets, plan, audit, physics, criteria."""
+"""One trial from what is believed of the part to the verdict: targets, plan, audit, physics, criteria."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
-import numpy as np
 import pinocchio as pin
 
-from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_episode
+from dyngrasp.closed_loop.episode import grasp_controller, run_episode
+from dyngrasp.closed_loop.first_look import FirstLook
 from dyngrasp.closed_loop.pose_source import PoseSource
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.closed_loop.replanning_loop import ReplanEvent
 from dyngrasp.closed_loop.vision_record import VisionRecord
-from dyngrasp.errors import OutOfReach
+from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.experiments.draws import Trial
 from dyngrasp.experiments.metrics import Outcome, judge
 from dyngrasp.experiments.provenance import versions
-from dyngrasp.experiments.replanning import replanning_loop, replanning_summary
-from dyngrasp.experiments.vision import camera_poses, films, vision_summary
+from dyngrasp.experiments.replanning import replanning_loop
+from dyngrasp.experiments.trial_world import TrialWorld, trial_world
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved, ranked_grasp_targets
 from dyngrasp.planning.problem import PlanResult, Status
 from dyngrasp.planning.replanning.target_update import target_updater
-from dyngrasp.simulation.mujoco_plant import MujocoPlant
-from dyngrasp.simulation.plant import TruthfulPlant
-from dyngrasp.simulation.scene import Scene, SceneSettings, build_scene
+from dyngrasp.signals import Array
+from dyngrasp.simulation.scene import Scene
 from dyngrasp.trajectory import GraspPlan
 
 # Arm postures that are tried, best first, before a pose counts as not plannable.
@@ -41,6 +40,10 @@ LATER = (1.0, 1.1, 1.25)
 
 # When a moving part may be in reach (s).
 FIRST_GUESSES = (0.0, 2.0, 4.0, 6.0)
+
+# After the planned grasp by so much (s) no more pictures are taken: a replanned grasp may come a little later, and once
+# the fingers hold the part nobody asks where it is.
+AFTER_GRASP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,24 +82,33 @@ def planner_for(workcell: Workcell) -> CollocationPlanner:
     return CollocationPlanner(workcell.task, settings)
 
 
-def plan_trial(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> PlannedTrial:
-    """Plan for the pose that the trial believes in; the next-best arm posture is tried where one fails.
+def plan_trial(
+    workcell: Workcell, trial: Trial, planner: CollocationPlanner, look: FirstLook | None = None
+) -> PlannedTrial:
+    """Plan for what is believed of the part; the next-best arm posture is tried where one fails.
+
+    Args:
+        workcell: Scenario and models.
+        trial: What the planner is told, if nobody looks.
+        planner: Plans.
+        look: What the first look found; the plan begins when the arm has waited for it.
 
     Raises:
         OutOfReach: No posture reaches the part.
         GraspRefused: The gripper cannot take or hold it.
+        InvalidProblem: Nothing is known of the part: the scenario wants it seen, and no look found it.
     """
     began = time.perf_counter()
     first: tuple[GraspTargets, PlanResult] | None = None
-    attempts = 0
-    T, twist = trial.T_world_object_believed, trial.twist_believed
+    attempts, belief = 0, _belief(trial, look)
+    T, twist = belief.T_world_object, belief.twist_world
     if twist.any():
-        T = moved(T, twist, _first_grasp_time(workcell, trial, planner))
+        T = moved(T, twist, _first_grasp_time(workcell, belief, planner))
     for targets in islice(ranked_grasp_targets(T, workcell.task, workcell.q_start), CANDIDATES):
         attempts += 1
-        result = planner.plan(workcell.q_start, targets)
+        result = planner.plan(workcell.q_start, targets, start_time=belief.t)
         if result.plan is not None and twist.any():
-            targets, result = _met(workcell, trial, planner, targets, result.plan)
+            targets, result = _met(workcell, belief, planner, targets, result.plan)
         if result.ok:
             return PlannedTrial(targets, result, 1e3 * (time.perf_counter() - began), attempts)
         # Of several failures the best posture's says most.
@@ -105,11 +117,30 @@ def plan_trial(workcell: Workcell, trial: Trial, planner: CollocationPlanner) ->
     return PlannedTrial(*first, 1e3 * (time.perf_counter() - began), attempts)
 
 
-def _first_grasp_time(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> float:
+@dataclass(frozen=True)
+class _Belief:
+    """Where the part is at time t (s), when the motion begins, and how it moves (m/s, rad/s)."""
+
+    T_world_object: pin.SE3
+    twist_world: Array
+    t: float = 0.0
+
+
+def _belief(trial: Trial, look: FirstLook | None) -> _Belief:
+    if look is not None and look.estimate is not None:
+        seen = look.estimate
+        T = moved(seen.T_world_object, seen.twist_world, look.start_time - seen.t_capture)
+        return _Belief(T, seen.twist_world, look.start_time)
+    if trial.T_world_object_believed is None:
+        raise InvalidProblem('with pose.source = "camera" a plan needs a first look that found the part')
+    return _Belief(trial.T_world_object_believed, trial.twist_believed)
+
+
+def _first_grasp_time(workcell: Workcell, belief: _Belief, planner: CollocationPlanner) -> float:
     """When a moving part is met depends on where, and where on when: how long it takes to where it soon will be (s)."""
     failure: OutOfReach | None = None
     for guess in FIRST_GUESSES:
-        T = moved(trial.T_world_object_believed, trial.twist_believed, guess)
+        T = moved(belief.T_world_object, belief.twist_world, guess)
         try:
             targets = grasp_targets(T, workcell.task, workcell.q_start)
         except OutOfReach as error:
@@ -124,19 +155,19 @@ def _first_grasp_time(workcell: Workcell, trial: Trial, planner: CollocationPlan
 
 
 def _met(
-    workcell: Workcell, trial: Trial, planner: CollocationPlanner, standing: GraspTargets, plan: GraspPlan
+    workcell: Workcell, belief: _Belief, planner: CollocationPlanner, standing: GraspTargets, plan: GraspPlan
 ) -> tuple[GraspTargets, PlanResult]:
     """Targets and plan that meet a moving part, from a plan for one that stands about where it will be met."""
     updater, duration = target_updater(workcell.task), float(plan.durations[1])
     targets, result = standing, PlanResult(Status.INFEASIBLE, None, (), None, {}, "the part rides out of reach")
     for later in LATER:
-        grasp_time = later * float(plan.phase_ends[1])
-        T = moved(trial.T_world_object_believed, trial.twist_believed, grasp_time)
+        after = later * (float(plan.phase_ends[1]) - belief.t)
+        T = moved(belief.T_world_object, belief.twist_world, after)
         try:
-            targets = updater.update(standing, T, trial.twist_believed, grasp_time, duration)
+            targets = updater.update(standing, T, belief.twist_world, belief.t + after, duration)
         except OutOfReach:
             break
-        result = planner.plan(workcell.q_start, targets)
+        result = planner.plan(workcell.q_start, targets, start_time=belief.t)
         if result.ok:
             break
     return targets, result
@@ -149,6 +180,7 @@ def execute_trial(
     progress: Callable[[float, str], None] | None = None,
     planner: CollocationPlanner | None = None,
     source: PoseSource | None = None,
+    world: TrialWorld | None = None,
 ) -> ExecutedTrial:
     """Carry out a valid plan in the plant that the trial drew, and judge what happened.
 
@@ -159,122 +191,36 @@ def execute_trial(
         progress: Called with time (s) and phase as the episode runs.
         planner: States the problems that the replanner falls back on; one is made if it is needed and left out.
         source: Tells the replanner where the part is, in place of what the scenario's `[pose]` says.
+        world: In which the first look was taken; a new one is made if there was none.
     """
     task, plan = workcell.task, planned.result.require()
-    period = 1.0 / workcell.scenario.plant.control_rate_hz
-    settings = SceneSettings(timestep=min(SceneSettings().timestep, period))
-    filmed = films(workcell) and source is None
-    scene = build_scene(
-        task.robot,
-        task.gripper,
-        task.grasp_object,
-        trial.variation,
-        settings,
-        markers=filmed,
-        conveyor=trial.conveyor,
-    )
-    plant: TruthfulPlant = MujocoPlant(
-        scene, plan.arm[0].position[0], plan.gripper[0].position[0], trial.T_world_object, t=plan.start_time
-    )
-    controller = grasp_controller(task, planned.targets.grasp, period)
-    meta = {"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()}
+    meta = episode_meta(workcell, trial)
     with ExitStack() as stack:
-        camera = stack.enter_context(camera_poses(workcell, trial, plan, scene)) if filmed else None
-        if camera is not None:
-            plant = camera.filmed(plant)
+        world = world or stack.enter_context(trial_world(workcell, trial, filmed=False))
+        camera = world.camera
         planner = planner or planner_for(workcell)
         loop = replanning_loop(workcell, trial, plan, planned.targets, planner, source or camera)
+        if camera is not None:
+            # Without replanning nobody looks any more.
+            camera.until = plan.start_time if loop is None else float(plan.phase_ends[1]) + AFTER_GRASP
         record = run_episode(
             plan,
-            plant,
-            controller,
-            EpisodeSettings(control_period=period),
+            world.plant,
+            grasp_controller(task, planned.targets.grasp, world.rates.control_period),
+            world.rates,
             replanning=loop,
+            recorder=world.recorder,
             progress=progress,
             meta=meta,
         )
-    vision = None if camera is None else camera.finish(meta)
+        vision = world.vision(meta)
     targets, events, not_taken = planned.targets, (), ()
     if loop is not None:
         plan, targets, events, not_taken = loop.newest, loop.targets, tuple(loop.events), tuple(loop.not_taken)
-    outcome = judge(plan, record, task, targets.grasp)
-    return ExecutedTrial(record, outcome, scene, plan, targets, events, not_taken, vision)
+    outcome = judge(plan, record, task, targets.grasp, planned.result.require().start_time)
+    return ExecutedTrial(record, outcome, world.scene, plan, targets, events, not_taken, vision)
 
 
-def summary(trial: Trial, planned: PlannedTrial, executed: ExecutedTrial | None) -> dict[str, Any]:
-    """The content of `summary.json`; without an execution the criteria are empty and `cause` says why."""
-    result = planned.result
-    document: dict[str, Any] = {
-        "success": executed is not None and executed.outcome.success,
-        "cause": executed.outcome.cause if executed else f"planning: {result.status}: {result.message}",
-        "criteria": executed.outcome.summary() if executed else {},
-        "replanning": replanning_summary(executed.replans, executed.not_taken) if executed else {},
-        "vision": vision_summary(executed.vision) if executed else {},
-        "phases": result.plan.durations.tolist() if result.plan else [],
-        "planning_ms": planned.planning_ms,
-        "planning_attempts": planned.attempts,
-        "timings_ms": result.timings_ms,
-        "plan_status": str(result.status),
-        "grasp": planned.targets.grasp.name,
-        "worst": worst_ratios(planned, executed),
-        "tracking": executed.outcome.details if executed else {},
-        "seed": trial.seed,
-        "versions": versions(),
-    }
-    return document
-
-
-def worst_ratios(planned: PlannedTrial, executed: ExecutedTrial | None) -> dict[str, float | None]:
-    """Largest ratio to each limit; `position` and `velocity` in the plant where there was one, else as planned.
-
-    `acceleration` is None for an arm whose file states no such limit.
-    """
-    audit = planned.result.audit
-    if audit is None:
-        return {}
-    ratios: dict[str, float | None] = {name: audit[name].worst for name in ("position", "velocity")}
-    ratios["torque_planned"] = audit["torque"].worst
-    if executed is not None:
-        ratios.update(executed.outcome.worst)
-    ratios["acceleration"] = audit["acceleration"].worst or None
-    return ratios
-
-
-def study_row(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> dict[str, Any]:
-    """Run a trial to the end and flatten it into one row of a study; a trial that cannot be planned is a row too."""
-    began = time.perf_counter()
-    row = _drawn(trial, workcell)
-    planned = plan_trial(workcell, trial, planner)
-    executed = execute_trial(workcell, trial, planned, planner=planner) if planned.result.ok else None
-    document = summary(trial, planned, executed)
-    row |= {
-        key: document[key] for key in ("success", "cause", "planning_ms", "planning_attempts", "plan_status", "grasp")
-    }
-    row |= dict(zip(("approach_s", "grasp_s", "deliver_s"), document["phases"], strict=False))
-    criteria = dict(document["criteria"])
-    passed = criteria.pop("passed", {})
-    row |= criteria
-    row |= {f"passed_{name}": verdict for name, verdict in passed.items()}
-    row |= {f"worst_{name}": ratio for name, ratio in document["worst"].items()}
-    row |= document["tracking"]
-    row |= {key: document["replanning"].get(key) for key in ("replans", "published", "too_uncertain")}
-    row["trial_ms"] = 1e3 * (time.perf_counter() - began)
-    return row
-
-
-def _drawn(trial: Trial, workcell: Workcell) -> dict[str, Any]:
-    """What chance decided: pose of the part, error of the believed pose in the grasp frame, friction and mass."""
-    T, T_object_grasp = trial.T_world_object, workcell.task.grasp_object.grasps[0].T_object_grasp
-    error = (T * T_object_grasp).actInv(trial.T_world_object_believed * T_object_grasp)
-    return {
-        "seed": trial.seed,
-        "x_m": float(T.translation[0]),
-        "y_m": float(T.translation[1]),
-        "yaw_deg": float(np.rad2deg(pin.rpy.matrixToRpy(T.rotation)[2])),
-        "error_along_mm": 1e3 * float(error.translation[0]),
-        "error_across_mm": 1e3 * float(error.translation[1]),
-        "error_up_mm": 1e3 * float(error.translation[2]),
-        "error_deg": float(np.rad2deg(np.linalg.norm(pin.log3(error.rotation)))),
-        "friction": trial.variation.friction,
-        "mass_factor": trial.variation.mass_factor,
-    }
+def episode_meta(workcell: Workcell, trial: Trial) -> dict[str, Any]:
+    """What is kept with the records of a trial."""
+    return {"scenario": workcell.scenario.model_dump(mode="json"), "seed": trial.seed, "versions": versions()}

@@ -23,32 +23,20 @@ from dyngrasp.perception.marker_pose import MarkerPoseSolver
 from dyngrasp.perception.part_tracker import PartTracker, PartTrackerSettings
 from dyngrasp.perception.pose_filter import PoseFilterSettings
 from dyngrasp.perception.pose_track import CameraErrors
-from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.camera_sensor import CameraSensor, ImagingSettings
 from dyngrasp.simulation.scene import Scene
-from dyngrasp.trajectory import GraspPlan
 
 # Of all random streams of a trial this one belongs to the pictures: the others stay what they are without them.
 _IMAGE_STREAM = 8
 
-# After the planned grasp by so much (s) no more pictures are taken: a replanned grasp may come a little later, and once
-# the fingers hold the part nobody asks where it is.
-_AFTER_GRASP = 0.5
-
-
-def films(workcell: Workcell) -> bool:
-    """Whether a trial takes pictures: only a replanner looks at them."""
-    return workcell.scenario.pose.source == "camera" and workcell.scenario.replanner.enabled
-
 
 @contextmanager
-def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene) -> Iterator[CameraPoses]:
-    """The camera of a scenario on the hand of a scene that shows the markers.
+def camera_poses(workcell: Workcell, trial: Trial, scene: Scene) -> Iterator[CameraPoses]:
+    """The camera of a scenario on the hand of a scene that shows the markers; nothing is believed beforehand.
 
     Args:
         workcell: Scenario and models.
-        trial: What is believed of the part at first, and the seed.
-        plan: The first plan; says when the grasp is.
+        trial: Gives the seed.
         scene: Built with `markers=True`.
 
     Raises:
@@ -59,14 +47,6 @@ def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene
     true = workcell.camera
     streams = np.random.SeedSequence(trial.seed, spawn_key=(_IMAGE_STREAM,)).spawn(2)
     believed = _misplaced(true, 1e-3 * section.mount_mm, np.deg2rad(section.mount_deg), streams[0])
-    deviations = np.repeat([1e-3 * section.prior_mm, np.deg2rad(section.prior_deg)], 3)
-    prior = PoseEstimate(
-        trial.T_world_object_believed,
-        np.diag(deviations**2),
-        plan.start_time,
-        plan.start_time,
-        trial.twist_believed,
-    )
     imaging = ImagingSettings(
         brightness=section.brightness,
         noise=section.noise,
@@ -76,13 +56,11 @@ def camera_poses(workcell: Workcell, trial: Trial, plan: GraspPlan, scene: Scene
     settings = CameraPosesSettings(
         latency=1e-3 * section.latency_ms,
         exposures=section.exposures,
-        start=plan.start_time,
-        until=plan.start_time + float(np.sum(plan.durations[:2])) + _AFTER_GRASP,
         keep_every=section.keep_every,
     )
     detector = MarkerDetector(task.grasp_object)
     solver = MarkerPoseSolver(believed, task.grasp_object)
-    tracker = PartTracker(solver, task.robot, task.gripper, prior, tracker_settings(workcell.scenario))
+    tracker = PartTracker(solver, task.robot, task.gripper, settings=tracker_settings(workcell.scenario))
     with CameraSensor(scene, true, imaging) as sensor:
         yield CameraPoses(sensor, detector, tracker, settings)
 

@@ -34,12 +34,15 @@ def run_table(summary: dict[str, Any]) -> Table:
     table.add_column(style="bold")
     table.add_column(justify="right")
     table.add_column(style="dim")
+    if summary["first_look"]:
+        _add_look(table, summary["first_look"])
     phases = summary["phases"]
-    table.add_row("Plan", "", "")
-    for name, duration in zip(PHASE_NAMES, phases, strict=False):
-        table.add_row(f"  {name}", f"{duration:.3f} s", "")
-    table.add_row("  whole motion", f"{sum(phases):.3f} s", "")
-    table.add_row("  planning", f"{summary['planning_ms']:.1f} ms", _attempts(summary["planning_attempts"]))
+    if phases:
+        table.add_row("Plan", "", "")
+        for name, duration in zip(PHASE_NAMES, phases, strict=False):
+            table.add_row(f"  {name}", f"{duration:.3f} s", "")
+        table.add_row("  whole motion", f"{sum(phases):.3f} s", "")
+        table.add_row("  planning", f"{summary['planning_ms']:.1f} ms", _attempts(summary["planning_attempts"]))
     replanning = summary.get("replanning")
     if replanning:
         published = f"{replanning['published']} of {replanning['replans']}"
@@ -70,6 +73,15 @@ def run_table(summary: dict[str, Any]) -> Table:
             f"rms; largest {1e3 * tracking['tracking_max_rad']:.2f} mrad",
         )
     return table
+
+
+def _add_look(table: Table, look: dict[str, Any]) -> None:
+    table.add_row("First look", f"{look['s']:.2f} s", f"{look['frames']} pictures, {look['with_markers']} with markers")
+    if "deviation_mm" in look:
+        table.add_row("  grasp point", f"± {look['deviation_mm']:.1f} mm", "as the filter says, one standard deviation")
+        table.add_row(
+            "  off by", f"{look['error_mm']:.1f} mm, {look['error_deg']:.2f}°", "which only a simulation knows"
+        )
 
 
 def study_table(report: dict[str, Any]) -> Table:
