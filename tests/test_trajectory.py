@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dyngrasp.errors import InvalidTrajectory, PlanFileError
+from dyngrasp.signals import frozen
 from dyngrasp.trajectory import GraspPlan, Trajectory
 
 
@@ -77,6 +78,25 @@ def test_the_rule_holds_and_a_broken_rule_shows():
 def test_arrays_are_read_only():
     with pytest.raises(ValueError, match="read-only"):
         collocated(4, 1, 1.0, 0).position[0, 0] = 1.0
+
+
+def test_what_somebody_could_still_write_to_is_copied():
+    grid = np.zeros((5, 2))
+    view = grid[:]
+    view.setflags(write=False)
+    trajectory = Trajectory(1.0, view, grid, grid)
+    grid[:] = 1.0
+    assert not trajectory.position.any()
+    assert not trajectory.velocity.any()
+
+
+def test_what_nobody_can_write_to_is_shared():
+    block = frozen(np.zeros((3, 5, 2)))
+    trajectory = Trajectory(1.0, *block)
+    assert np.shares_memory(trajectory.position, block)
+    # other numbers and other layouts are none of its own
+    assert Trajectory(1.0, *frozen(np.zeros((3, 5, 2), np.float32))).position.dtype == float
+    assert Trajectory(1.0, *frozen(np.zeros((3, 2, 5))).transpose(0, 2, 1)).position.flags.c_contiguous
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
+_FLOAT = np.dtype(float)
+
+
 def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
-    """A contiguous read-only float copy of `values`.
+    """`values` as a contiguous read-only float array: a copy, unless they are one that nobody can write to.
 
     Args:
         values: Anything numpy can turn into floats.
@@ -21,7 +24,7 @@ def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     Raises:
         ValueError: The shape differs.
     """
-    array = np.array(values, dtype=float, order="C")
+    array: Array = values if _is_frozen(values) else np.array(values, dtype=float, order="C")  # type: ignore[assignment]
     if shape is not None:
         # A plain loop: this runs many times in every control period.
         fits = array.ndim == len(shape)
@@ -31,6 +34,27 @@ def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
             raise ValueError(f"expected shape {shape}, got {array.shape}")
     array.setflags(write=False)
     return array
+
+
+def frozen(array: Array) -> Array:
+    """The same array, read-only from now on: for one just made that nobody else holds, so that none has to copy it."""
+    array.setflags(write=False)
+    return array
+
+
+def _is_frozen(values: ArrayLike) -> bool:
+    """Whether these are contiguous floats in memory that belongs to a read-only array."""
+    if type(values) is not np.ndarray or values.dtype is not _FLOAT:
+        return False
+    flags, owner = values.flags, values.base
+    if flags.writeable or not flags.c_contiguous:
+        return False
+    return flags.owndata if owner is None else type(owner) is np.ndarray and _is_frozen_owner(owner)
+
+
+def _is_frozen_owner(array: Array) -> bool:
+    flags = array.flags
+    return flags.owndata and not flags.writeable
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +15,7 @@ from numba import njit
 from numpy.typing import ArrayLike
 
 from dyngrasp.errors import InvalidTrajectory, PlanFileError
-from dyngrasp.signals import Array, JointState, read_only
+from dyngrasp.signals import Array, JointState, frozen, read_only
 
 PHASE_NAMES = ("approach", "grasp", "deliver")
 
@@ -42,14 +44,15 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "duration", float(self.duration))
-        for name in ("position", "velocity", "acceleration"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        shapes = {self.position.shape, self.velocity.shape, self.acceleration.shape}
-        if len(shapes) != 1 or self.position.ndim != 2 or self.position.shape[0] < 2:
+        q, w, v = (read_only(array) for array in (self.position, self.velocity, self.acceleration))
+        for name, array in (("position", q), ("velocity", w), ("acceleration", v)):
+            object.__setattr__(self, name, array)
+        if not (q.shape == w.shape == v.shape and q.ndim == 2 and len(q) >= 2):
+            shapes = {q.shape, w.shape, v.shape}
             raise InvalidTrajectory(f"position, velocity and acceleration need one shape (N+1, n), N ≥ 1; got {shapes}")
-        if not (np.isfinite(self.duration) and self.duration > 0):
+        if not (math.isfinite(self.duration) and self.duration > 0):
             raise InvalidTrajectory(f"duration must be a positive number of seconds, got {self.duration}")
-        if not _all_finite(self.position, self.velocity, self.acceleration):
+        if not _all_finite(q, w, v):
             raise InvalidTrajectory("a trajectory holds finite numbers only")
 
     @property
@@ -64,8 +67,15 @@ class Trajectory:
 
     def sample(self, t: float) -> JointState:
         """State at one time, clamped to [0, duration]; see `sample_many`."""
-        position, velocity, acceleration = self.sample_many([t])
-        return JointState(float(t), position[0], velocity[0], acceleration[0])
+        return self.sample_as(t, float(t))
+
+    def sample_as(self, local: float, t: float, at_rest: bool = False) -> JointState:
+        """State at `local` (s) under the time `t` (s) of another clock; with velocity and acceleration 0 if at rest."""
+        state = np.empty((3, 1, self.position.shape[1]))
+        _interpolate(self.duration, self.position, self.velocity, self.acceleration, np.array([local]), state)
+        if at_rest:
+            state[1:] = 0.0
+        return JointState(t, *frozen(state)[:, 0])
 
     def sample_many(self, times: ArrayLike) -> tuple[Array, Array, Array]:
         """States between the grid points, consistent with the collocation.
@@ -82,7 +92,9 @@ class Trajectory:
             Position, velocity, acceleration, each (M, n).
         """
         times = np.asarray(times, dtype=float)
-        return _interpolated(self.duration, self.position, self.velocity, self.acceleration, times)
+        out = np.empty((3, times.size, self.position.shape[1]))
+        _interpolate(self.duration, self.position, self.velocity, self.acceleration, times, out)
+        return out[0], out[1], out[2]
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
@@ -102,36 +114,40 @@ def largest_difference(a, b):
 
 
 @njit(cache=True)
+def _largest_jump(q_0, w_0, q_1, w_1, q_2, w_2):
+    """Largest jump of positions and velocities (N+1, n) over both joins of three phases."""
+    first = max(largest_difference(q_0[-1], q_1[0]), largest_difference(w_0[-1], w_1[0]))
+    return max(first, max(largest_difference(q_1[-1], q_2[0]), largest_difference(w_1[-1], w_2[0])))
+
+
+@njit(cache=True, fastmath={"reassoc"})
 def _all_finite(position, velocity, acceleration):
-    for k in range(position.shape[0]):
-        for i in range(position.shape[1]):
-            if not (np.isfinite(position[k, i]) and np.isfinite(velocity[k, i]) and np.isfinite(acceleration[k, i])):
-                return False
+    for array in (position, velocity, acceleration):
+        # What is no number or infinite leaves no zero when it is taken from itself.
+        rest = 0.0
+        for value in array.ravel():
+            rest += value - value
+        if rest != 0.0:
+            return False
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _interpolated(duration, position, velocity, acceleration, times):
-    """`Trajectory.sample_many`; compiled, for controllers and audits ask for little and often."""
+def _interpolate(duration, position, velocity, acceleration, times, out):
+    """`Trajectory.sample_many` (3, M, n); compiled, for controllers and audits ask for little and often."""
     N, n = position.shape[0] - 1, position.shape[1]
     step = duration / N
-    q, w, v = np.empty((times.size, n)), np.empty((times.size, n)), np.empty((times.size, n))
     for m in range(times.size):
         scaled = min(max(times[m], 0.0), duration) / step
         k = max(min(int(scaled), N - 1), 0)
         s = scaled - k
+        by_rate, half, sixth, gain = step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12), step * s**2 / 2
         for i in range(n):
             v_k = acceleration[k, i]
             dv = acceleration[k + 1, i] - v_k
-            q[m, i] = (
-                position[k, i]
-                + (step * s) * velocity[k, i]
-                + (step**2 * s**2 / 2) * v_k
-                + (step**2 * (s**3 / 6 + s / 12)) * dv
-            )
-            w[m, i] = velocity[k, i] + (step * s) * v_k + (step * s**2 / 2) * dv
-            v[m, i] = v_k + s * dv
-    return q, w, v
+            out[0, m, i] = position[k, i] + by_rate * velocity[k, i] + half * v_k + sixth * dv
+            out[1, m, i] = velocity[k, i] + by_rate * v_k + gain * dv
+            out[2, m, i] = v_k + s * dv
 
 
 @njit(cache=True, error_model="numpy")
@@ -192,17 +208,19 @@ class GraspPlan:
                     raise InvalidTrajectory(
                         f"{what}, phase {phase}: {trajectory.position.shape[1]} columns for {len(joints)} joints"
                     )
-            self._check_joins(phases, what)
+            largest = _largest_jump(*(array for phase in phases for array in (phase.position, phase.velocity)))
+            if not largest <= JOIN_TOLERANCE:
+                self._refuse_jump(phases, what)
         for phase, arm, gripper in zip(PHASE_NAMES, self.arm, self.gripper, strict=True):
             if abs(arm.duration - gripper.duration) > JOIN_TOLERANCE:
                 raise InvalidTrajectory(f"phase {phase}: arm takes {arm.duration} s, gripper {gripper.duration} s")
 
     @staticmethod
-    def _check_joins(phases: tuple[Trajectory, ...], what: str) -> None:
+    def _refuse_jump(phases: tuple[Trajectory, ...], what: str) -> None:
         for i in range(len(phases) - 1):
             for name in ("position", "velocity"):
                 jump = largest_difference(getattr(phases[i], name)[-1], getattr(phases[i + 1], name)[0])
-                if jump > JOIN_TOLERANCE:
+                if not jump <= JOIN_TOLERANCE:
                     raise InvalidTrajectory(
                         f"{what}: {name} jumps by {jump:.2e} between {PHASE_NAMES[i]} and {PHASE_NAMES[i + 1]}"
                     )
@@ -217,26 +235,26 @@ class GraspPlan:
         """(3,) times T_1, T_2, T_3 at which the phases end, on the common clock (s)."""
         return read_only(self.start_time + np.cumsum(self.durations))
 
+    @cached_property
+    def _ends(self) -> tuple[float, ...]:
+        return tuple(self.phase_ends.tolist())
+
     @property
     def end_time(self) -> float:
         """Time at which the motion ends (s)."""
-        return float(self.phase_ends[-1])
+        return self._ends[-1]
 
     def phase_at(self, t: float) -> int:
         """Index of the phase that time `t` falls into; a join belongs to the later phase."""
-        return int(min(np.searchsorted(self.phase_ends, t, side="right"), len(PHASE_NAMES) - 1))
+        return min(bisect_right(self._ends, t), len(PHASE_NAMES) - 1)
 
     def sample(self, t: float) -> PlanSample:
         """Arm and gripper at time `t` on the common clock, held at the ends of the plan."""
         i = self.phase_at(t)
-        local = t - (self.phase_ends[i] - self.durations[i])
-        return PlanSample(PHASE_NAMES[i], *(self._state(phases[i], local, t) for phases in (self.arm, self.gripper)))
-
-    def _state(self, trajectory: Trajectory, local: float, t: float) -> JointState:
-        position, velocity, acceleration = (values[0] for values in trajectory.sample_many([local]))
-        if t > self.end_time:
-            velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
-        return JointState(t, position, velocity, acceleration)
+        local, over = t - (self._ends[i] - self.arm[i].duration), t > self.end_time
+        return PlanSample(
+            PHASE_NAMES[i], self.arm[i].sample_as(local, t, over), self.gripper[i].sample_as(local, t, over)
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the plan as JSON: per phase times, positions, velocities and accelerations of arm and gripper."""

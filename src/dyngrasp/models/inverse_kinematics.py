@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.models.srs_kinematics import SrsKinematics
@@ -28,6 +29,7 @@ __all__ = [
     "InverseKinematics",
     "inverse_kinematics_for",
     "joint_velocity",
+    "null_space_velocity",
 ]
 
 TWIST_TOLERANCE = 1e-8
@@ -92,9 +94,7 @@ def joint_velocity(robot: RobotModel, q: ArrayLike, twist_world: ArrayLike, swiv
     q, twist = _vector(robot, q), np.asarray(twist_world, dtype=float)
     if twist.shape != (6,) or not np.isfinite(twist).all() or not math.isfinite(swivel_rate):
         raise InvalidProblem(f"six finite numbers of a twist and a finite swivel rate expected: {twist}, {swivel_rate}")
-    J = robot.jacobian(q)
-    rate: Array = np.linalg.lstsq(J, twist, rcond=_RATE_CUTOFF)[0].astype(float)
-    missing = float(np.linalg.norm(J @ rate - twist))
+    rate, missing = robot.flange_chain.least_rates(q, twist) or _least_squares_rates(robot.jacobian(q), twist)
     if missing > TWIST_TOLERANCE * max(1.0, float(np.linalg.norm(twist))):
         raise InvalidProblem(
             f"{robot.name} is singular at q = {q.round(4).tolist()}: it cannot move with the twist "
@@ -103,6 +103,38 @@ def joint_velocity(robot: RobotModel, q: ArrayLike, twist_world: ArrayLike, swiv
     if swivel_rate == 0.0:
         return rate
     return rate + swivel_rate * inverse_kinematics_for(robot).null_space_rate(q)
+
+
+def _least_squares_rates(J: Array, twist: Array) -> tuple[Array, float]:
+    """Rates of least norm among those that miss least of a twist, and by how much they miss it."""
+    rate: Array = np.linalg.lstsq(J, twist, rcond=_RATE_CUTOFF)[0].astype(float)
+    return rate, float(np.linalg.norm(J @ rate - twist))
+
+
+def null_space_velocity(rate: Array, towards: Array, limit: Array, least_rate: float, least_ratio: float) -> Array:
+    """A multiple (n,) of a null-space rate (n,) (rad/s): turned towards a direction (n,) and fast enough to show.
+
+    Args:
+        rate: See `InverseKinematics.null_space_rate`; the answer is zero if it is.
+        towards: Direction whose product with the answer is not negative.
+        limit: Speed limits (rad/s).
+        least_rate: Least multiple.
+        least_ratio: Least max-norm of the answer over the limits.
+    """
+    velocity = np.empty(rate.size)
+    _null_space_velocity(rate, towards, limit, least_rate, least_ratio, velocity)
+    return velocity
+
+
+@njit(cache=True, error_model="numpy")
+def _null_space_velocity(rate, towards, limit, least_rate, least_ratio, velocity):
+    ratio, along = 0.0, 0.0
+    for i in range(rate.size):
+        ratio = max(ratio, abs(rate[i]) / limit[i])
+        along += rate[i] * towards[i]
+    factor = 0.0 if ratio == 0.0 else max(least_rate, least_ratio / ratio)
+    for i in range(rate.size):
+        velocity[i] = (factor if along >= 0.0 else -factor) * rate[i]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.errors import ModelFileError
+from dyngrasp.models.flange_chain import FlangeChain
 from dyngrasp.models.kinematic_tree import frame_id, frames_named, read_tree, require_chain, require_length
 from dyngrasp.models.limits import JointLimits
 from dyngrasp.models.model_file import Finite, NonNegative, Positive, StrictSchema, decode, read_toml
@@ -118,6 +119,11 @@ class RobotModel:
     @cached_property
     def _data(self) -> pin.Data:
         return self.loaded_model.createData()
+
+    @cached_property
+    def flange_chain(self) -> FlangeChain:
+        """Kinematics of the flange for compiled code and for cycles that count microseconds."""
+        return FlangeChain.from_pinocchio(self.pin_model, self.T_last_flange)
 
     @cached_property
     def mass(self) -> float:

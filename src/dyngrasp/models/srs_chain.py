@@ -37,7 +37,17 @@ from dyngrasp.signals import Array, read_only
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = ["BRANCHES", "ROUNDING", "ElbowCircle", "SrsChain", "configurations", "joint_vector"]
+__all__ = [
+    "ALIGNED",
+    "BRANCHES",
+    "ROUNDING",
+    "ElbowCircle",
+    "SrsChain",
+    "arm_angle_of",
+    "circle_at",
+    "configurations",
+    "joint_vector",
+]
 
 BRANCHES = 8
 VERTICAL = 1e-9
@@ -49,7 +59,8 @@ then set on the edge, which moves the flange by about as much."""
 STRAIGHT = 1e-7
 """Elbow angle (rad) below which it is taken as zero. The reach depends on it in second order only: this moves the
 flange by 1e-15 m, whereas an angle that is rounding alone would give the joints beside it an arbitrary turn."""
-_ALIGNED = 1e-12
+ALIGNED = 1e-12
+"""Length (m) and sine below which a direction is lost."""
 _NEARLY_ALIGNED = 1e-6
 
 _, _Y, _Z = np.eye(3)
@@ -122,7 +133,7 @@ class SrsChain:
     def arm_angle(self, q: ArrayLike) -> float:
         """Arm angle ψ (rad, in (−π, π]) of a configuration q (7,) (rad); the module states the convention."""
         _, a, b, _ = self.lengths
-        return _arm_angle(joint_vector(q), a, b)
+        return arm_angle_of(joint_vector(q), a, b)
 
     def null_space_rate(self, q: ArrayLike) -> Array:
         """Joint rates dq/dψ (7,) that turn the elbow about S–W at 1 rad/s and keep the flange where it is.
@@ -133,18 +144,10 @@ class SrsChain:
         """
         q = joint_vector(q)
         _, a, b, _ = self.lengths
-        u, _ = _shoulder_to_wrist(q, a, b)
-        shoulder, k_s = _euler_rates(q[0], q[1], u)
-        L = self.reach(q[3])
-        if L < _ALIGNED:
+        rate = np.empty(7)
+        if not _null_space_rate(q, a, b, rate):
             raise InvalidProblem("the wrist centre lies on the shoulder centre: there is no arm angle")
-        wrist, k_w = _euler_rates(q[4], q[5], np.array([-a * math.sin(q[3]), 0.0, -(b + a * math.cos(q[3]))]) / L)
-        rate = np.concatenate([k_w * shoulder, [0.0], k_s * wrist])
-        if k_s == 1.0 and k_w == 1.0:
-            return rate
-        if k_s == 0.0 and k_w == 0.0:
-            rate[:3] = shoulder
-        return rate / np.linalg.norm(rate)
+        return rate
 
     def circle(self, T_world_flange: pin.SE3, nearest: float, farthest: float) -> ElbowCircle:
         """The circle of the elbow for a flange pose.
@@ -159,11 +162,11 @@ class SrsChain:
             InvalidProblem: A pose that is not finite.
         """
         R, p = T_world_flange.rotation, T_world_flange.translation
-        elbow, rotations, L = _circle(R, p, self.lengths, nearest, farthest)
+        elbow, rotations, L = circle_at(R, p, self.lengths, nearest, farthest)
         excess = max(L - farthest, nearest - L)
         if not math.isfinite(L):
             raise InvalidProblem("the flange pose holds a number that is not finite")
-        if excess > ROUNDING or L < _ALIGNED:
+        if excess > ROUNDING or L < ALIGNED:
             how = "farther than the arm reaches" if farthest < L else "nearer than the elbow can fold"
             where = f"the wrist centre would be {L:.6g} m from the shoulder, {max(excess, 0.0):.3g} m {how}"
             raise OutOfReach("the flange pose", max(excess, 0.0), where)
@@ -186,11 +189,12 @@ def _shoulder_to_wrist(q, a, b):
     y = np.array([-c1 * c2 * s3 - s1 * c3, -s1 * c2 * s3 + c1 * c3, s2 * s3])
     z = np.array([c1 * s2, s1 * s2, c2])
     w = -b * np.sin(q[3]) * x + (a + b * np.cos(q[3])) * z
-    return w / max(np.sqrt((w**2).sum()), _ALIGNED), y
+    return w / max(np.sqrt((w**2).sum()), ALIGNED), y
 
 
 @njit(cache=True, error_model="numpy")
-def _arm_angle(q, a, b):
+def arm_angle_of(q, a, b):
+    """`SrsChain.arm_angle` for the lengths a and b of upper arm and forearm (m)."""
     u, y = _shoulder_to_wrist(q, a, b)
     # Joint 4's axis instead of the elbow's offset from S–W: it keeps its direction where the offset vanishes.
     h = np.array([y[1] * u[2] - y[2] * u[1], y[2] * u[0] - y[0] * u[2], y[0] * u[1] - y[1] * u[0]])
@@ -212,7 +216,7 @@ def _reference_directions(u):
 
 
 @njit(cache=True, error_model="numpy")
-def _circle(R, p, lengths, nearest, farthest):
+def circle_at(R, p, lengths, nearest, farthest):
     """`ElbowCircle.elbow` and `.rotations` for a flange pose with S–W brought into its bounds, and S–W as it is."""
     base, a, b, tool = lengths
     wrist = np.array([p[0] - tool * R[0, 2], p[1] - tool * R[1, 2], p[2] - tool * R[2, 2] - base])
@@ -282,7 +286,7 @@ def _zyz_angles(R, out):
     There the first angle is zero and the third takes all of the turn.
     """
     tilt = np.hypot(R[2], R[5])
-    aligned = tilt < _ALIGNED
+    aligned = tilt < ALIGNED
     first = 0.0 if aligned else np.arctan2(R[5], R[2])
     # cos and sin of the first angle. From the upper two rows instead of the last one, which vanishes with the tilt.
     c, s = (1.0, 0.0) if aligned else (R[2] / tilt, R[5] / tilt)
@@ -300,15 +304,36 @@ def _share_turn(q, middle):
     q[0], q[2] = 0.5 * sign * turn, 0.5 * turn
 
 
-def _euler_rates(first: float, middle: float, omega: Array) -> tuple[Array, float]:
-    """K · rates (3,) of Rz(first) Ry(middle) Rz(third) for angular velocity omega; k ≤ 1 keeps them finite."""
-    c, s = math.cos(first), math.sin(first)
+@njit(cache=True, error_model="numpy")
+def _null_space_rate(q, a, b, rate):
+    """Write `SrsChain.null_space_rate`; whether there is an arm angle at all."""
+    L = np.sqrt(max(a * a + b * b + 2.0 * a * b * np.cos(q[3]), 0.0))
+    if L < ALIGNED:
+        return False
+    u, _ = _shoulder_to_wrist(q, a, b)
+    k_s = _euler_rates(q[0], q[1], u, rate[:3])
+    k_w = _euler_rates(q[4], q[5], np.array([-a * np.sin(q[3]), 0.0, -(b + a * np.cos(q[3]))]) / L, rate[4:])
+    rate[3] = 0.0
+    if k_s == 1.0 and k_w == 1.0:
+        return True
+    if k_s != 0.0 or k_w != 0.0:
+        rate[:3] *= k_w
+    rate[4:] *= k_s
+    rate /= np.sqrt((rate**2).sum())
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _euler_rates(first, middle, omega, rates):
+    """Write k · rates (3,) of Rz(first) Ry(middle) Rz(third) for angular velocity omega; k ≤ 1 keeps them finite."""
+    c, s = np.cos(first), np.sin(first)
     along, across = c * omega[0] + s * omega[1], -s * omega[0] + c * omega[1]
-    sine, cosine = math.sin(middle), math.cos(middle)
+    sine, cosine = np.sin(middle), np.cos(middle)
     if abs(sine) > _NEARLY_ALIGNED:
         third, k = along / sine, 1.0
     elif abs(along) <= ROUNDING:
         third, k = 0.0, 1.0
     else:
         third, k = along, sine
-    return np.array([k * omega[2] - cosine * third, k * across, third]), k
+    rates[0], rates[1], rates[2] = k * omega[2] - cosine * third, k * across, third
+    return k

@@ -16,7 +16,17 @@ import pinocchio as pin
 from numba import njit
 
 from dyngrasp.errors import InvalidProblem, ModelFileError, OutOfReach
-from dyngrasp.models.srs_chain import BRANCHES, ROUNDING, ElbowCircle, SrsChain, configurations, joint_vector
+from dyngrasp.models.srs_chain import (
+    ALIGNED,
+    BRANCHES,
+    ROUNDING,
+    ElbowCircle,
+    SrsChain,
+    arm_angle_of,
+    circle_at,
+    configurations,
+    joint_vector,
+)
 from dyngrasp.signals import Array, read_only
 
 if TYPE_CHECKING:
@@ -161,6 +171,21 @@ class SrsKinematics:
                 f"rad, outside [{lower[worst]:.6g}, {upper[worst]:.6g}]",
             )
         return q
+
+    def follow(self, T_world_flange: pin.SE3, q_reference: ArrayLike) -> Array:
+        """The configuration (7,) with the arm angle and the branch of another one (7,) (rad).
+
+        Raises:
+            OutOfReach, InvalidProblem: As `solve`.
+        """
+        q_reference, q = joint_vector(q_reference), np.empty(7)
+        limits = self.limits
+        if _follow(
+            T_world_flange.rotation, T_world_flange.translation, q_reference, self._chain.lengths, *self._reach,
+            self._middle, limits.position_lower, limits.position_upper, q,
+        ):  # fmt: skip
+            return q
+        return self.solve(T_world_flange, self.arm_angle(q_reference), self.branch(q_reference))
 
     def scan(self, T_world_flange: pin.SE3, arm_angles: int | ArrayLike = ARM_ANGLES) -> SrsSolutions:
         """All configurations within the limits, over a grid of arm angles and all branches.
@@ -311,6 +336,20 @@ def _nearest(elbow, rotations, grid, step, branches, reference, weight, middle, 
         if least < best:
             best, best_q = least, found
     return best_q, best
+
+
+@njit(cache=True, error_model="numpy")
+def _follow(R, p, q_reference, lengths, nearest, farthest, middle, lower, upper, out):
+    """Write `SrsKinematics.follow`; whether there is such a configuration."""
+    elbow, rotations, L = circle_at(R, p, lengths, nearest, farthest)
+    if not (L >= ALIGNED and nearest - ROUNDING <= L <= farthest + ROUNDING):
+        return False
+    psi, branch = np.empty(1), np.empty((1, 1), np.int64)
+    psi[0] = arm_angle_of(q_reference, lengths[1], lengths[2])
+    branch[0, 0] = (q_reference[1] < 0.0) + 2 * (q_reference[3] < 0.0) + 4 * (q_reference[5] < 0.0)
+    q, within = _admissible(elbow, rotations, psi, branch, middle, lower, upper)
+    out[:] = q[0, 0]
+    return within[0, 0]
 
 
 @njit(cache=True, error_model="numpy")

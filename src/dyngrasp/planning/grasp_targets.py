@@ -12,7 +12,7 @@ from numba import njit
 
 from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.grasp_object import Grasp
-from dyngrasp.models.inverse_kinematics import joint_velocity
+from dyngrasp.models.inverse_kinematics import joint_velocity, null_space_velocity
 from dyngrasp.planning.grasp_task import GraspTask, TaskSettings
 from dyngrasp.signals import Array, read_only
 
@@ -296,9 +296,6 @@ def swivel_velocity(q: Array, q_start: Array, task: GraspTask, like: Array | Non
     It turns the way the motion from start to target goes on the whole, or the way of `like` if given.
     """
     rate = task.kinematics.null_space_rate(q)
-    ratio = float(np.abs(rate / task.robot.limits.velocity).max())
-    if ratio == 0.0:
-        return np.zeros_like(q)
-    direction = like if like is not None else (task.place - q_start) / task.robot.limits.velocity**2
-    sign = 1.0 if float(rate @ direction) >= 0 else -1.0
-    return sign * rate * max(task.settings.swivel_rate, task.settings.swivel_speed_ratio / ratio)
+    limit, settings = task.robot.limits.velocity, task.settings
+    direction = like if like is not None else (task.place - q_start) / limit**2
+    return null_space_velocity(rate, direction, limit, settings.swivel_rate, settings.swivel_speed_ratio)

@@ -75,7 +75,7 @@ def carried_descent(
         now, end = start + k / N * reference.duration, start + reference.duration
         return _since(targets, now, end) * at_end * _since(previous, now, end).inverse()
 
-    axis = old_end.rotation @ updater.approach_axis_in_flange
+    axis = old_end.rotation @ updater.outward(targets.gripper_open)
     lowest = float(axis @ old_end.act(p_flange_grasp)) - task.settings.pregrasp_distance
     top = lowest + settings.height * task.grasp_object.funnel.z_threshold
 

@@ -8,10 +8,12 @@ import numpy as np
 import pinocchio as pin
 
 from dyngrasp.errors import InvalidProblem, OutOfReach
+from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity
 from dyngrasp.models.srs_kinematics import SrsKinematics
 from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask, moved, swivel_velocity
-from dyngrasp.signals import Array
+from dyngrasp.signals import Array, frozen
+from dyngrasp.trajectory import largest_difference
 
 # Where the arm angle of the running plan is forbidden at the new pose, others are tried, nearest first (rad).
 _ARM_ANGLE_STEPS = np.deg2rad(np.arange(2.0, 61.0, 2.0))
@@ -19,6 +21,9 @@ _ARM_ANGLE_STEPS = np.deg2rad(np.arange(2.0, 61.0, 2.0))
 # The wrist follows the part's yaw; a joint that turns farther (rad) has flipped to an equivalent angle beyond its
 # limits.
 _LARGEST_TURN = 2.5
+
+_AT_REST = frozen(np.zeros(6))
+_REMEMBERED = 64
 
 
 class TargetUpdater:
@@ -28,7 +33,7 @@ class TargetUpdater:
         self.task = task
         self._kinematics = inverse_kinematics_for(task.robot)
         self._hands: dict[bytes, pin.SE3] = {}
-        self._outward = self._hand(task.gripper.open_posture).inverse().rotation[:, 2]
+        self._flanges: dict[tuple[Grasp, bytes, float], pin.SE3] = {}
 
     def update(
         self,
@@ -55,29 +60,31 @@ class TargetUpdater:
             OutOfReach: No posture of this branch reaches the new pose.
         """
         task, settings, grasp = self.task, self.task.settings, previous.grasp
-        twist = np.zeros(6) if twist_world is None else np.asarray(twist_world, dtype=float)
-        T_before = moved(T_world_object, twist, -grasp_duration) if twist.any() else T_world_object
-        above = pin.SE3(np.eye(3), np.array([0.0, 0.0, settings.pregrasp_distance]))
-        T_grasp = T_world_object * grasp.T_object_grasp * self._hand(previous.gripper_closed)
-        T_pregrasp = T_before * grasp.T_object_grasp * above * self._hand(previous.gripper_open)
+        moving = twist_world is not None and bool(np.any(twist_world))
+        twist = _AT_REST if twist_world is None else np.asarray(twist_world, dtype=float)
+        T_before = moved(T_world_object, twist, -grasp_duration) if moving else T_world_object
+        T_grasp = T_world_object * self._flange_at(grasp, previous.gripper_closed, 0.0)
+        T_pregrasp = T_before * self._flange_at(grasp, previous.gripper_open, settings.pregrasp_distance)
 
         q = self.posture(T_grasp, previous.grasped.position)
         q_before = self.posture(T_pregrasp, previous.pregrasp.position)
-        approach_axis = (T_before * grasp.T_object_grasp).rotation[:, 2]
-        approach = _carried(twist, T_before, T_pregrasp)
-        approach[:3] -= settings.approach_speed * approach_axis
-        lift = _carried(twist, T_world_object, T_grasp)
+        approach, lift = np.zeros(6), np.zeros(6)
+        if moving:
+            approach, lift = _carried(twist, T_before, T_pregrasp), _carried(twist, T_world_object, T_grasp)
+        approach[:3] -= settings.approach_speed * (T_pregrasp.rotation @ self.outward(previous.gripper_open))
         lift[2] += settings.lift_speed
         try:
             velocity_before = joint_velocity(task.robot, q_before, approach)
             velocity = joint_velocity(task.robot, q, lift)
         except InvalidProblem as error:
             raise OutOfReach("the grasp", 0.0, str(error)) from error
+        velocity_before += swivel_velocity(q_before, q_before, task, like=previous.pregrasp.velocity)
+        velocity += swivel_velocity(q, q, task, like=previous.grasped.velocity)
         return GraspTargets(
             T_world_object=T_world_object,
             grasp=grasp,
-            pregrasp=BoundaryState(q_before, velocity_before + self._swivel(q_before, previous.pregrasp.velocity)),
-            grasped=BoundaryState(q, velocity + self._swivel(q, previous.grasped.velocity)),
+            pregrasp=BoundaryState(frozen(q_before), frozen(velocity_before)),
+            grasped=BoundaryState(frozen(q), frozen(velocity)),
             place=previous.place,
             gripper_open=previous.gripper_open,
             gripper_closed=previous.gripper_closed,
@@ -86,21 +93,28 @@ class TargetUpdater:
             twist_world=twist,
         )
 
-    def _hand(self, posture: Array) -> pin.SE3:
-        """T_grasp_flange with the gripper in a posture."""
+    def T_flange_grasp(self, posture: Array) -> pin.SE3:
+        """The grasp frame as the hand holds it with its fingers in a posture (m,), in the flange frame."""
         key = posture.tobytes()
         if key not in self._hands:
             gripper = self.task.gripper
-            self._hands[key] = (gripper.T_flange_hand * gripper.T_hand_grasp(posture)).inverse()
+            # The fingers have few postures at the ends of phases, but moving ones need no memory of their own.
+            if len(self._hands) >= _REMEMBERED:
+                self._hands.clear()
+            self._hands[key] = gripper.T_flange_hand * gripper.T_hand_grasp(posture)
         return self._hands[key]
 
-    def _swivel(self, q: Array, like: Array) -> Array:
-        return swivel_velocity(q, q, self.task, like=like)
+    def outward(self, posture: Array) -> Array:
+        """(3,) axis of the grasp frame that points away from the part, in the flange frame."""
+        return self.T_flange_grasp(posture).rotation[:, 2]
 
-    @property
-    def approach_axis_in_flange(self) -> Array:
-        """(3,) outward axis of the grasp frame as the hand holds it, in the flange frame."""
-        return self._outward
+    def _flange_at(self, grasp: Grasp, posture: Array, height: float) -> pin.SE3:
+        """The flange in the object frame with the hand at a height above the grasp frame (m)."""
+        key = grasp, posture.tobytes(), height
+        if key not in self._flanges:
+            above = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
+            self._flanges[key] = grasp.T_object_grasp * above * self.T_flange_grasp(posture).inverse()
+        return self._flanges[key]
 
     def posture(self, T_world_flange: pin.SE3, q_previous: Array) -> Array:
         """The configuration (n,) of the branch, and if the limits allow of the arm angle, of a previous one (n,) (rad).
@@ -112,12 +126,12 @@ class TargetUpdater:
         if not isinstance(kinematics, SrsKinematics):
             q = kinematics.nearest(T_world_flange, q_previous)
         else:
-            branch, angle = kinematics.branch(q_previous), kinematics.arm_angle(q_previous)
             try:
-                q = kinematics.solve(T_world_flange, angle, branch)
+                q = kinematics.follow(T_world_flange, q_previous)
             except OutOfReach:
+                branch, angle = kinematics.branch(q_previous), kinematics.arm_angle(q_previous)
                 q = self._nearest_arm_angle(T_world_flange, angle, branch)
-        turn = float(np.abs(q - q_previous).max())
+        turn = largest_difference(q, q_previous)
         if turn > _LARGEST_TURN:
             raise OutOfReach("the new pose", 0.0, f"a joint would have to turn by {np.rad2deg(turn):.0f}° to follow it")
         return q

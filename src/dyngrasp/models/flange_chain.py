@@ -1,0 +1,139 @@
+"""One posture at a time, compiled: where the flange of a serial chain is, and the joint rates that move it.
+
+`batch_dynamics` is for many postures at once. Here is what a replanning cycle asks for a dozen times, each time of one
+posture: its kernels can be called from other compiled code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numba import njit
+
+from dyngrasp.models.batch_dynamics import BatchModel
+from dyngrasp.signals import Array, read_only
+
+# Pivots of the Jacobian's rows below this share of the largest: too near to a singular posture for normal arithmetic.
+_SINGULAR = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class FlangeChain:
+    """A chain of n revolute joints and a flange.
+
+    Attributes:
+        rotations, offsets: (n+1, 3, 3), (n+1, 3) frame of each joint in that of the joint before it, where all stand at
+            zero; every frame is turned so that its joint turns about z. The last one is the flange's.
+    """
+
+    rotations: Array
+    offsets: Array
+
+    @classmethod
+    def from_pinocchio(cls, model: pin.Model, T_last_flange: pin.SE3) -> FlangeChain:
+        """Read a chain whose joints are all revolute.
+
+        Args:
+            model: The chain.
+            T_last_flange: The flange in the frame of the last joint.
+        """
+        tree = BatchModel.from_pinocchio(model)
+        flange = tree.attach([(model.njoints - 1, T_last_flange)])
+        return cls(
+            read_only(np.concatenate([tree.rotations, flange.rotations])),
+            read_only(np.concatenate([tree.offsets, flange.positions])),
+        )
+
+    def pose(self, q: Array) -> pin.SE3:
+        """T_world_flange at q (n,) (rad)."""
+        frames = np.empty((len(self.offsets), 3, 4))
+        place_frames(self.rotations, self.offsets, q, frames)
+        return pin.SE3(frames[-1, :, :3], frames[-1, :, 3])
+
+    def least_rates(self, q: Array, twist_world: Array) -> tuple[Array, float] | None:
+        """Joint rates (n,) of least norm for a twist (6,) of the flange, and the norm of what they miss of it.
+
+        None with fewer than six joints, or near a singular posture: least squares are for another method then.
+        """
+        rates = np.empty(q.size)
+        missing = least_rates(self.rotations, self.offsets, q, twist_world, rates) if q.size >= 6 else -1.0
+        return (rates, missing) if missing >= 0.0 else None
+
+
+@njit(cache=True, error_model="numpy")
+def place_frames(rotations, offsets, q, frames):
+    """Write the frames [R | p] (n+1, 3, 4) of all joints and of the flange in the world."""
+    for i in range(offsets.shape[0]):
+        if i == 0:
+            frames[0, :, :3], frames[0, :, 3] = rotations[0], offsets[0]
+        else:
+            _put_after(frames[i - 1], rotations[i], offsets[i], frames[i])
+        if i < q.size:
+            c, s = np.cos(q[i]), np.sin(q[i])
+            for a in range(3):
+                x, y = frames[i, a, 0], frames[i, a, 1]
+                frames[i, a, 0], frames[i, a, 1] = c * x + s * y, c * y - s * x
+
+
+@njit(cache=True, error_model="numpy")
+def _put_after(before, rotation, offset, frame):
+    for a in range(3):
+        x, y, z = before[a, 0], before[a, 1], before[a, 2]
+        for b in range(3):
+            frame[a, b] = x * rotation[0, b] + y * rotation[1, b] + z * rotation[2, b]
+        frame[a, 3] = before[a, 3] + x * offset[0] + y * offset[1] + z * offset[2]
+
+
+@njit(cache=True, error_model="numpy")
+def least_rates(rotations, offsets, q, twist, rates):
+    """`FlangeChain.least_rates`; −1 instead of what is missing where it does not answer.
+
+    With J = L Q, Q's six rows orthonormal, the rates are Qᵀ L⁻¹ twist.
+    """
+    n = q.size
+    frames, J = np.empty((n + 1, 3, 4)), np.empty((6, n))
+    place_frames(rotations, offsets, q, frames)
+    for i in range(n):
+        ax, ay, az = frames[i, 0, 2], frames[i, 1, 2], frames[i, 2, 2]
+        rx, ry = frames[n, 0, 3] - frames[i, 0, 3], frames[n, 1, 3] - frames[i, 1, 3]
+        rz = frames[n, 2, 3] - frames[i, 2, 3]
+        J[0, i], J[1, i], J[2, i] = ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx
+        J[3, i], J[4, i], J[5, i] = ax, ay, az
+    Q, L, y = J.copy(), np.zeros((6, 6)), np.empty(6)
+    largest = 0.0
+    for row in range(6):
+        # Twice is enough: the second time takes away what rounding left in the first.
+        for _ in range(2):
+            for other in range(row):
+                along = 0.0
+                for i in range(n):
+                    along += Q[row, i] * Q[other, i]
+                L[row, other] += along
+                for i in range(n):
+                    Q[row, i] -= along * Q[other, i]
+        size = 0.0
+        for i in range(n):
+            size += Q[row, i] ** 2
+        L[row, row] = np.sqrt(size)
+        largest = max(largest, L[row, row])
+        if not L[row, row] > _SINGULAR * largest:
+            return -1.0
+        y[row] = twist[row]
+        for i in range(n):
+            Q[row, i] /= L[row, row]
+        for other in range(row):
+            y[row] -= L[row, other] * y[other]
+        y[row] /= L[row, row]
+    rates[:] = 0.0
+    for row in range(6):
+        for i in range(n):
+            rates[i] += Q[row, i] * y[row]
+    missing = 0.0
+    for row in range(6):
+        rest = -twist[row]
+        for i in range(n):
+            rest += J[row, i] * rates[i]
+        missing += rest * rest
+    return np.sqrt(missing)
