@@ -4,6 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from dyngrasp.errors import ScenarioError
 from dyngrasp.experiments.draws import draw_trial, trial_seed
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.experiments.workcell import Workcell, load_workcell
@@ -78,3 +79,30 @@ def test_the_true_pose_is_the_true_pose():
     trial = draw_trial(cell, 11)
     assert trial.T_world_object_believed is not None
     np.testing.assert_allclose(trial.T_world_object_believed.homogeneous, trial.T_world_object.homogeneous, atol=1e-15)
+
+
+RELOCATION = ("relocation.distance_mm=[20,50]", "relocation.at_s=[1.5,2.5]", "relocation.within_s=0.4")
+
+
+def test_a_relocation_is_drawn_within_its_ranges_and_leaves_the_rest_as_it_is():
+    moved, still = workcell(*RELOCATION), workcell()
+    for index in range(40):
+        a, b = draw_trial(moved, trial_seed(3, index)), draw_trial(still, trial_seed(3, index))
+        plate = a.conveyor
+        assert plate is not None
+        assert b.conveyor is None
+        start, stop = plate.run
+        assert 1.5 <= start <= 2.5
+        assert stop - start == pytest.approx(0.4)
+        assert 0.02 <= plate.speed * 0.4 <= 0.05
+        # Nobody knows beforehand: at first the part stands.
+        assert not a.twist_world.any()
+        assert not a.twist_believed.any()
+        lifted = a.T_world_object.translation - b.T_world_object.translation
+        np.testing.assert_allclose(lifted, [0.0, 0.0, plate.height], atol=1e-15)
+        assert a.variation.friction == b.variation.friction
+
+
+def test_a_part_stands_on_one_plate():
+    with pytest.raises(ScenarioError, match="one of them"):
+        workcell(*RELOCATION, "conveyor.speed_m_s=0.1")

@@ -77,3 +77,26 @@ def test_without_a_conveyor_nothing_moves_under_the_part(scene, make_plant):
 def test_bad_conveyors_are_refused(bad):
     with pytest.raises(InvalidProblem):
         Conveyor(**{"velocity": VELOCITY, "centre": START, **bad})
+
+
+def test_a_part_that_is_moved_away_rides_from_rest_to_rest(robot, gripper, casting, ideal, make_plant, placed):
+    # 30 mm within 0.3 s: at 2.1 m/s² friction, of 0.5 g, still carries it.
+    moves = Conveyor(np.array([0.06, 0.08]), START, run=(0.05, 0.35))
+    plant = make_plant(build_scene(robot, gripper, casting, ideal, conveyor=moves), position=tuple(placed))
+    way = []
+    for _ in range(450):
+        hold(robot, plant)
+        truth = plant.truth()
+        way.append([truth.t, *(truth.T_world_part.translation - placed)[:2], *truth.part_twist[:2]])
+    t, position, speed = np.array(way)[:, 0], np.array(way)[:, 1:3], np.array(way)[:, 3:]
+    assert np.abs(position[t < 0.05]).max() < 1e-5
+    np.testing.assert_allclose(position[t > 0.36], np.tile(0.3 * moves.velocity, ((t > 0.36).sum(), 1)), atol=1e-4)
+    assert np.abs(speed[t > 0.37]).max() < 1e-3
+    # Twice the mean in the middle.
+    np.testing.assert_allclose(speed[np.abs(t - 0.2).argmin()], 2.0 * moves.velocity, atol=2e-3)
+
+
+@pytest.mark.parametrize("run", [(1.0, 1.0), (2.0, 1.0), (np.nan, 1.0)])
+def test_a_conveyor_that_stops_before_it_starts_is_refused(run):
+    with pytest.raises(InvalidProblem):
+        Conveyor(VELOCITY, START, run=run)

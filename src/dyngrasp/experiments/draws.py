@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.experiments.scenario import ConveyorSection, PlantSection, PoseSection
+from dyngrasp.experiments.scenario import ConveyorSection, PlantSection, PoseSection, RelocationSection
 from dyngrasp.experiments.workcell import Workcell
 from dyngrasp.models.grasp_object import GraspObject
 from dyngrasp.signals import Array
@@ -29,8 +29,9 @@ class Trial:
         T_world_object: Where the part is.
         T_world_object_believed: Where the planner is told that it is; None if the camera has to find it.
         variation: What the planner does not know about the plant.
-        twist_world: (6,) velocity of the part (m/s, rad/s), world axes.
+        twist_world: (6,) velocity of the part at first (m/s, rad/s), world axes.
         twist_believed: (6,) what the planner is told of it, if it is told anything.
+        conveyor: What the part stands on, if not on the ground.
     """
 
     seed: int
@@ -39,13 +40,7 @@ class Trial:
     variation: PlantVariation
     twist_world: Array
     twist_believed: Array
-
-    @property
-    def conveyor(self) -> Conveyor | None:
-        """What the part stands on, if it moves."""
-        if not self.twist_world.any():
-            return None
-        return Conveyor(self.twist_world[:2], self.T_world_object.translation[:2])
+    conveyor: Conveyor | None
 
 
 def trial_seed(study_seed: int, index: int) -> int:
@@ -57,16 +52,21 @@ def trial_seed(study_seed: int, index: int) -> int:
 def draw_trial(workcell: Workcell, seed: int) -> Trial:
     """Draw the trial that belongs to a seed."""
     scenario, grasp_object = workcell.scenario, workcell.task.grasp_object
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)]
-    part_rng, pose_rng, plant_rng, conveyor_rng = streams
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
+    part_rng, pose_rng, plant_rng, conveyor_rng, relocation_rng = streams
     part = scenario.part
     x, y = part_rng.uniform(*part.x_m), part_rng.uniform(*part.y_m)
     yaw = np.deg2rad(part_rng.uniform(*part.yaw_deg))
     z = part_rng.uniform(*part.z_m) if part.z_m is not None else grasp_object.rest_height
     T_world_object = pin.SE3(pin.utils.rotate("z", yaw), np.array([x, y, z]))
     twist, twist_believed = _twists(scenario.conveyor, conveyor_rng)
+    conveyor = None
     if twist.any():
-        T_world_object = standing_on(Conveyor(twist[:2], np.zeros(2)), T_world_object)
+        conveyor = Conveyor(twist[:2], T_world_object.translation[:2])
+    elif scenario.relocation is not None:
+        conveyor = _relocation(scenario.relocation, T_world_object.translation[:2], relocation_rng)
+    if conveyor is not None:
+        T_world_object = standing_on(conveyor, T_world_object)
     return Trial(
         seed=seed,
         T_world_object=T_world_object,
@@ -74,6 +74,7 @@ def draw_trial(workcell: Workcell, seed: int) -> Trial:
         variation=_variation(scenario.plant, workcell.task.robot.n, plant_rng),
         twist_world=twist,
         twist_believed=twist_believed,
+        conveyor=conveyor,
     )
 
 
@@ -85,6 +86,14 @@ def _twists(section: ConveyorSection | None, rng: np.random.Generator) -> tuple[
     speed, heading = rng.uniform(*section.speed_m_s), np.deg2rad(rng.uniform(*section.heading_deg))
     true[:2] = speed * np.array([np.cos(heading), np.sin(heading)])
     return true, (1.0 + section.speed_error * rng.uniform(-1.0, 1.0)) * true
+
+
+def _relocation(section: RelocationSection, centre: Array, rng: np.random.Generator) -> Conveyor:
+    """The plate that moves the part away."""
+    distance, heading = 1e-3 * rng.uniform(*section.distance_mm), np.deg2rad(rng.uniform(*section.heading_deg))
+    at = rng.uniform(*section.at_s)
+    velocity = distance / section.within_s * np.array([np.cos(heading), np.sin(heading)])
+    return Conveyor(velocity, centre, length=0.4, width=0.4, run=(at, at + section.within_s))
 
 
 def _believed(

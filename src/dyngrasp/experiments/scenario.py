@@ -30,6 +30,7 @@ __all__ = [
     "PlannerSection",
     "PlantSection",
     "PoseSection",
+    "RelocationSection",
     "RenderSection",
     "ReplannerSection",
     "TaskSection",
@@ -87,6 +88,20 @@ class ConveyorSection(StrictSchema):
     speed_m_s: PositiveRange
     heading_deg: Range = (90.0, 90.0)
     speed_error: Spread = 0.0
+
+
+class RelocationSection(StrictSchema):
+    """`[relocation]`: the part is moved away while the arm is under way, and nobody tells the planner.
+
+    It stands on a plate that slides in the ground, by `distance_mm` in the direction `heading_deg` (from the world's x
+    axis to its y axis), smoothly from `at_s` on, within `within_s`. Times count from the beginning of the episode, the
+    first look included.
+    """
+
+    distance_mm: PositiveRange
+    at_s: PositiveRange
+    within_s: Annotated[float, Field(gt=0.0, le=10.0)] = 0.3
+    heading_deg: Range = (-180.0, 180.0)
 
 
 class PlannerSection(StrictSchema):
@@ -227,12 +242,19 @@ class Scenario(StrictSchema):
     task: TaskSection
     part: PartSection
     conveyor: ConveyorSection | None = None
+    relocation: RelocationSection | None = None
     planner: PlannerSection = PlannerSection()
     pose: PoseSection = PoseSection()
     camera: CameraSection = CameraSection()
     replanner: ReplannerSection = ReplannerSection()
     plant: PlantSection = PlantSection()
     render: RenderSection = RenderSection()
+
+    @model_validator(mode="after")
+    def _one_plate(self) -> Self:
+        if self.conveyor is not None and self.relocation is not None:
+            raise ValueError("conveyor and relocation: one of them; the part stands on one plate")
+        return self
 
 
 def load_scenario(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> Scenario:

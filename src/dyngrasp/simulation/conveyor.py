@@ -31,10 +31,11 @@ class Conveyor:
     """A straight conveyor in the ground's plane.
 
     Attributes:
-        velocity: (2,) of its surface (m/s), world axes.
+        velocity: (2,) of its surface (m/s), world axes; if it runs for a while only, the mean over that time.
         centre: (2,) where the middle of the plate is at the start (m).
         length, width: Of the plate, along and across its motion (m).
         height: Of its surface above the ground (m): a part on it touches the plate alone.
+        run: From when to when it runs (s): then from rest to rest, smoothly. Always, at one speed, if infinite.
     """
 
     velocity: Array
@@ -42,6 +43,7 @@ class Conveyor:
     length: float = 1.6
     width: float = 0.24
     height: float = 0.001
+    run: tuple[float, float] = (-np.inf, np.inf)
 
     def __post_init__(self) -> None:
         for name in ("velocity", "centre"):
@@ -50,11 +52,22 @@ class Conveyor:
             raise InvalidProblem(f"conveyor: finite numbers expected, got {self.velocity}, {self.centre}")
         if min(self.length, self.width, self.height) <= 0:
             raise InvalidProblem("conveyor: length, width and height must be > 0")
+        if not self.run[0] < self.run[1]:
+            raise InvalidProblem(f"conveyor: it must stop after it starts, got {self.run} s")
 
     @property
     def speed(self) -> float:
         """Of its surface (m/s)."""
         return float(np.linalg.norm(self.velocity))
+
+    def speed_at(self, t: float) -> float:
+        """Of its surface at time t (m/s)."""
+        start, stop = self.run
+        if not start <= t <= stop:
+            return 0.0
+        if np.isinf(stop - start):
+            return self.speed
+        return self.speed * (1.0 - float(np.cos(2.0 * np.pi * (t - start) / (stop - start))))
 
     @property
     def direction(self) -> Array:
@@ -63,10 +76,9 @@ class Conveyor:
             return np.array([1.0, 0.0, 0.0])
         return np.append(self.velocity / self.speed, 0.0)
 
-    @property
-    def twist_world(self) -> Array:
-        """(6,) velocity of what stands on it (m/s, rad/s)."""
-        return np.append(self.velocity, np.zeros(4))
+    def twist_at(self, t: float) -> Array:
+        """(6,) velocity of what stands on it at time t (m/s, rad/s)."""
+        return np.concatenate([self.speed_at(t) * self.direction, np.zeros(3)])
 
 
 def add_conveyor(spec: MjSpec, conveyor: Conveyor, settings: SceneSettings) -> None:
@@ -111,25 +123,18 @@ def add_conveyor(spec: MjSpec, conveyor: Conveyor, settings: SceneSettings) -> N
 
 @dataclass(frozen=True)
 class ConveyorAddresses:
-    """Where a conveyor is in MuJoCo's arrays, and how fast it runs (m/s) in which direction (3,)."""
+    """A conveyor, and where it is in MuJoCo's arrays."""
 
+    conveyor: Conveyor
     qpos: int
     dof: int
     actuator: int
-    speed: float
-    direction: Array
 
 
 def locate_conveyor(model: MjModel, conveyor: Conveyor) -> ConveyorAddresses:
     """Addresses in a compiled world."""
     joint = model.joint(CONVEYOR)
-    return ConveyorAddresses(
-        int(joint.qposadr[0]),
-        int(joint.dofadr[0]),
-        int(model.actuator(CONVEYOR).id),
-        conveyor.speed,
-        read_only(conveyor.direction, (3,)),
-    )
+    return ConveyorAddresses(conveyor, int(joint.qposadr[0]), int(joint.dofadr[0]), int(model.actuator(CONVEYOR).id))
 
 
 def standing_on(conveyor: Conveyor, T_world_object: pin.SE3) -> pin.SE3:

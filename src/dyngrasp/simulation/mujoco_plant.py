@@ -98,9 +98,10 @@ class MujocoPlant:
         self._arm, self._gripper, self._locked = slice(0, n), slice(n, n + m), slice(n + m, locked)
         data.ctrl[self._locked] = scene.locked_position
         if scene.conveyor is not None:
-            # It runs before the episode begins, and the part with it.
-            data.ctrl[scene.conveyor.actuator] = data.qvel[scene.conveyor.dof] = scene.conveyor.speed
-            data.qvel[scene.part_dof : scene.part_dof + 3] = scene.conveyor.speed * scene.conveyor.direction
+            # What runs at the start ran before, and the part with it.
+            data.ctrl[scene.conveyor.actuator] = scene.conveyor.conveyor.speed_at(t)
+            data.qvel[scene.conveyor.dof] = scene.conveyor.conveyor.speed_at(t)
+            data.qvel[scene.part_dof : scene.part_dof + 6] = scene.conveyor.conveyor.twist_at(t)
         mujoco.mj_forward(scene.model, data)
         self._observed_at = -1.0
         self._observation: Observation | None = None
@@ -138,6 +139,8 @@ class MujocoPlant:
         data.ctrl[self._arm] = np.clip(command.arm_torque, -scene.arm_torque_limit, scene.arm_torque_limit)
         limit = scene.gripper_torque_limit
         data.ctrl[self._gripper] = np.clip(command.gripper_torque, -limit, limit)
+        if scene.conveyor is not None:
+            data.ctrl[scene.conveyor.actuator] = scene.conveyor.conveyor.speed_at(self.t)
         if not np.isfinite(data.ctrl).all():
             raise PlantDiverged(f"a torque that is not finite was commanded at {self.t:.4f} s")
         mujoco.mj_step(scene.model, data)
@@ -162,7 +165,7 @@ class MujocoPlant:
         kinds = scene.geom_kind[data.contact.geom]
         support = np.zeros(3)
         if scene.conveyor is not None:
-            support = data.qpos[scene.conveyor.qpos] * scene.conveyor.direction
+            support = data.qpos[scene.conveyor.qpos] * scene.conveyor.conveyor.direction
         present = set(_CATEGORY_TABLE[kinds[:, 0], kinds[:, 1]].tolist())
         return Truth(
             t=self.t,
