@@ -226,17 +226,17 @@ def _grasp_postures(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask, q_st
     _, T_world_flange = flange_poses(grasp, T_world_object, task)
     postures = task.kinematics.solutions(T_world_flange)
     inside = limits.position_lower + margin, limits.position_upper - margin
-    times = _travel_times(postures, *inside, q_start, task.place, 1.0 / limits.velocity)
+    times = _travel_times(postures, *inside, q_start, task.place, limits.velocity)
     if not np.isfinite(times).any():
         raise _no_posture(grasp, task)
     return postures, times
 
 
-@njit(cache=True)
-def _travel_times(postures: Array, lower: Array, upper: Array, start: Array, place: Array, pace: Array) -> Array:
+@njit(cache=True, error_model="numpy")
+def _travel_times(postures: Array, lower: Array, upper: Array, start: Array, place: Array, speed: Array) -> Array:
     """(k,) time of the slowest joint at top speed from the start to each posture (k, n) and on to the target (s).
 
-    Infinite for a posture outside the limits; `pace` is 1 / speed.
+    Infinite for a posture outside the limits.
     """
     times = np.empty(len(postures))
     for k in range(len(postures)):
@@ -244,8 +244,8 @@ def _travel_times(postures: Array, lower: Array, upper: Array, start: Array, pla
         for j in range(postures.shape[1]):
             q = postures[k, j]
             inside = inside and lower[j] <= q <= upper[j]
-            there = max(there, abs(q - start[j]) * pace[j])
-            on = max(on, abs(place[j] - q) * pace[j])
+            there = max(there, abs(q - start[j]) / speed[j])
+            on = max(on, abs(place[j] - q) / speed[j])
         times[k] = there + on if inside else np.inf
     return times
 

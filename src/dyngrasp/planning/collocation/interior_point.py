@@ -68,8 +68,7 @@ class InteriorPoint:
         M = model.rows
         self.s, self.t, self.multiplier, self.ds, self.dt, self.dmultiplier = (np.zeros(M) for _ in range(6))
         self.g, self.dg, self.omega, self.y, self.e_s, self.e_t = (np.zeros(M) for _ in range(6))
-        self.s_new, self.t_new, self.g_new, self.multiplier_old, self.zero = (np.zeros(M) for _ in range(5))
-        self.T_old = 0.0
+        self.s_new, self.t_new, self.g_new, self.multiplier_old, self.multiplier_new = (np.zeros(M) for _ in range(5))
 
     def solve(
         self,
@@ -97,32 +96,30 @@ class InteriorPoint:
         self._allocate(model, x)
         settings = self.settings
         self.x[:], self.T = x, T
-        objective = model.values(self.x, self.T, self.g)
-        if not np.isfinite(objective):
+        self.objective = model.values(self.x, self.T, self.g)
+        if not np.isfinite(self.objective):
             return Outcome.NONFINITE, Best(self.x.copy(), T), 0
-        self.unit = max(abs(objective), 1e-3)
+        self.unit = max(abs(self.objective), 1e-3)
         self.price = settings.price * self.unit
         self.first_mu = barrier * self.unit
         self.best = Best(self.x.copy(), T)
         self.slow_limit, self.cautious = SLOW, cautious
         self._restart(1.0, 0)
         for iteration in range(settings.max_iterations + 1):
-            objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
             violation = -float(self.g.min())
-            if not np.isfinite(objective + violation):
+            if not np.isfinite(self.objective + violation):
                 if self.free and self.history:
                     self._leave_free_mode()
                     self._undo_step()
                     continue
                 return Outcome.NONFINITE, self.best, iteration
             violation = max(0.0, violation)
-            self.best.offer(self.x, self.T, objective, violation, settings.violation_tolerance)
+            self.best.offer(self.x, self.T, self.objective, violation, settings.violation_tolerance)
             feasible = violation <= settings.violation_tolerance
             if model.factor == 0.0 and feasible:
                 # There is a feasible point after all: the price of a violation had been too low.
                 self.price *= DEARER
                 self._restart(1.0, iteration)
-                objective = model.derivatives(self.x, self.T, self.multiplier, self.g)
             self._raise_price()
             if not self._factorise():
                 return Outcome.NONFINITE, self.best, iteration
@@ -153,7 +150,7 @@ class InteriorPoint:
                 self._undo_step()
             elif self.free:
                 self._mehrotra_step(mean)
-            elif not self._armijo_step(objective):
+            elif not self._armijo_step():
                 if feasible:
                     solved = error <= ACCEPTABLE * settings.tolerance * self.unit
                     return Outcome.OPTIMAL if solved else Outcome.STALLED, self.best, iteration
@@ -167,12 +164,16 @@ class InteriorPoint:
         settings = self.settings
         self.model.factor = factor
         self.mu = self.first_mu
-        self.model.values(self.x, self.T, self.g)
         rows.start(self.g, self.mu, self.price, settings.least_slack, self.s, self.t, self.multiplier)
+        self._evaluate()
         self.free, self.history, self.mean = settings.adaptive and not self.cautious, [], self.mu
         self.reference = NEAR * self.unit if self.cautious else np.inf
         self.last_shift, self.slow = 0.0, 0
         self.least_violation, self.since = np.inf, iteration
+
+    def _evaluate(self) -> None:
+        """Objective, rows and derivatives at the present point."""
+        self.objective = self.model.derivatives(self.x, self.T, self.multiplier, self.g)
 
     def _violation_stays(self, violation: float, error: float, iteration: int) -> bool:
         """Whether this point is stationary although it violates a row, or the violation has long ceased to fall."""
@@ -208,8 +209,8 @@ class InteriorPoint:
     def _undo_step(self) -> None:
         """Back to where the last free step began; the arrays of the new point still hold that point."""
         self._exchange()
-        self.T, self.T_old = self.T_old, self.T
         self.multiplier[:] = self.multiplier_old
+        self._evaluate()
 
     def _complementarity(self, primal: float, dual: float) -> tuple[float, float]:
         """Mean of s λ and sum of t (ν − λ) after steps of these lengths."""
@@ -270,54 +271,57 @@ class InteriorPoint:
         mu = max(min((after / mean) ** 3, 1.0) * mean, floor)
         self._direction(mu, corrected=True)
         primal, dual = self._lengths(KEEP)
-        np.multiply(self.dx, primal, out=self.x_new)
-        self.x_new += self.x
-        self.multiplier_old[:], self.T_old = self.multiplier, self.T
-        self.T += primal * self.dT
-        self.model.values(self.x_new, self.T, self.g)
+        self.multiplier_old[:] = self.multiplier
+        objective = self._look_ahead(primal, dual)
         steps = (self.ds, self.dt, primal, self.price, mu)
-        rows.moved_slacks(self.g, self.s, self.t, *steps, self.s_new, self.t_new)
-        self._accept(dual, mu, 0.0)
+        rows.moved_slacks(self.g_new, self.s, self.t, *steps, self.s_new, self.t_new)
+        self._accept(objective, dual, mu, 0.0)
 
-    def _armijo_step(self, objective: float) -> bool:
+    def _armijo_step(self) -> bool:
         """A step of the barrier problem for the present μ; False if rounding allows no descent."""
-        model, mu = self.model, self.mu
+        factor, mu = self.model.factor, self.mu
         products = self.s.size * mu
         decrement = self._direction(mu, corrected=False)
         mean, _ = self._complementarity(0.0, 0.0)
-        # y = 0: the right-hand side is then minus the gradient of the objective.
-        by_T = model.descent(self.zero, self.rhs)
-        slope = -float(np.vdot(self.rhs, self.dx)) - by_T * self.dT
+        slope = self.model.objective_slope(self.dT)
         slope += rows.barrier_slope(self.s, self.t, self.ds, self.dt, self.price, mu)
-        merit = model.factor * objective + rows.barrier(self.s, self.t, self.price, mu)
+        merit = factor * self.objective + rows.barrier(self.s, self.t, self.price, mu)
         length, dual = self._lengths(KEEP)
         while length > SHORTEST:
-            np.multiply(self.dx, length, out=self.x_new)
-            self.x_new += self.x
-            T = self.T + length * self.dT
-            objective = model.values(self.x_new, T, self.g_new)
+            objective = self._look_ahead(length, dual)
             steps = (self.ds, self.dt, length, self.price, mu)
             rows.moved_slacks(self.g_new, self.s, self.t, *steps, self.s_new, self.t_new)
-            trial = model.factor * objective + rows.barrier(self.s_new, self.t_new, self.price, mu)
+            trial = factor * objective + rows.barrier(self.s_new, self.t_new, self.price, mu)
             if trial <= merit + ARMIJO * length * slope + ROUNDING * abs(merit):
                 break
             length /= 2
         else:
             return False
-        self.T = T
-        self._accept(dual, mu, SPREAD)
+        self._accept(objective, dual, mu, SPREAD)
         if decrement + abs(mean * self.s.size - products) <= products:
             least = 1e-3 * self.settings.tolerance * self.unit / self.s.size
             self.mu = max(min(0.2 * mu, mu**1.5), least)
         return True
 
-    def _accept(self, dual: float, mu: float, spread: float) -> None:
+    def _look_ahead(self, primal: float, dual: float) -> float:
+        """Objective, rows and derivatives after a step; most often it is taken, and nothing is evaluated twice."""
+        np.multiply(self.dx, primal, out=self.x_new)
+        self.x_new += self.x
+        np.multiply(self.dmultiplier, dual, out=self.multiplier_new)
+        self.multiplier_new += self.multiplier
+        self.T_new = self.T + primal * self.dT
+        return self.model.derivatives(self.x_new, self.T_new, self.multiplier_new, self.g_new)
+
+    def _accept(self, objective: float, dual: float, mu: float, spread: float) -> None:
         """Move to the new point."""
+        self.objective = objective
         self._exchange()
         rows.move_multipliers(self.multiplier, self.dmultiplier, dual, self.s, self.t, self.price, mu, spread)
 
     def _exchange(self) -> None:
         """The new point becomes the present one and the other way round; nothing is copied."""
         self.x, self.x_new = self.x_new, self.x
+        self.T, self.T_new = self.T_new, self.T
+        self.g, self.g_new = self.g_new, self.g
         self.s, self.s_new = self.s_new, self.s
         self.t, self.t_new = self.t_new, self.t

@@ -25,6 +25,18 @@ def objective(a: Array, T: float, rho: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def objective_slope(a: Array, da: Array, T: float, dT: float, rho: float) -> float:
+    """How the objective changes to first order with steps da (N+1, n) and dT."""
+    weight = rho / (a.shape[0] - 1) / T**3
+    effort, product = 0.0, 0.0
+    for k in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            effort += a[k, j] * a[k, j]
+            product += a[k, j] * da[k, j]
+    return (1.0 - 3.0 * weight / T * effort) * dT + 2.0 * weight * product
+
+
+@njit(cache=True, error_model="numpy")
 def add_objective_gradient(a: Array, T: float, rho: float, factor: float, dual: Array) -> float:
     """Add factor · ∂f/∂a to dual[CURVATURE] (N+1, n); return factor · ∂f/∂T."""
     K, n = a.shape

@@ -135,6 +135,11 @@ class PhaseModel:
             out,
         )
 
+    def objective_slope(self, dT: float) -> float:
+        """Derivative of the weighted objective along the step that `newton_step` found last; dT is its change of T."""
+        work, rho = self.work, self.effort_weight
+        return self.factor * newton_matrix.objective_slope(work.z[CURVATURE], work.dz[CURVATURE], self._T, dT, rho)
+
     def newton_step(self, y: Array, rhs: Array, dx: Array, dg: Array, longest: float) -> tuple[float, float, float]:
         """The step of the factorised system for multipliers y, and how the rows change with it.
 
