@@ -151,3 +151,34 @@ def test_fixed_duration_takes_no_step(make_problem):
     model.derivatives(x, 1.5, multiplier, np.empty(model.rows))
     assert model.factorise(multiplier, multiplier, 1.0, 0.0)
     assert model.solve(x.copy(), 7.0) == 0.0
+
+
+def test_slope_of_the_objective_along_a_step(case):
+    model, x, T, multiplier = case
+    g, omega = np.empty(model.rows), np.full(model.rows, 0.7)
+    objective = model.derivatives(x, T, multiplier, g)
+    assert model.factorise(omega, multiplier, 0.0, 0.0)
+    model.complement = max(model.complement, 1.0)
+    dx, rhs, dg = np.empty_like(x), np.empty_like(x), np.empty(model.rows)
+    dT, _, _ = model.newton_step(multiplier, rhs, dx, dg, 0.5 * T)
+    slope = model.objective_slope(dT)
+    ahead, behind = (model.values(x + step * dx, T + step * dT, g) for step in (STEP, -STEP))
+    np.testing.assert_allclose((ahead - behind) / (2 * STEP), slope, atol=DIFFERENCE * max(abs(objective), 1.0))
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_walls_bend_by_second_derivative_over_squared_slope(make_problem, iiwa, scale):
+    N = 6
+    q, v, p = ca.SX.sym("q", 7), ca.SX.sym("v", 7), ca.SX.sym("p", 0)
+    row = ca.Function("circle", [q, v, p], [q[0] ** 2 + q[1] ** 2])
+    bounds = (np.array([x]) for x in (-np.inf, 9.0, scale))
+    circle = NodeConstraint("circle", row, np.empty((N + 1, 0)), *bounds)
+    problem = make_problem(5, intervals=N, constraints=(constraints.torque_rows(iiwa, N), circle))
+    model = model_of(problem)
+    motion = least_effort(problem, 1.0)
+    radius = np.linalg.norm(motion.position[1:-1, :2], axis=1)
+    # Second derivatives 2/scale of two joints, slope 2 r/scale.
+    expected = np.sqrt(8.0) / scale / (2 * radius.min() / scale) ** 2
+    np.testing.assert_allclose(model.bend(model.map.unknowns(motion), 1.0), expected, rtol=1e-9)
+    without = model_of(make_problem(5, intervals=N, constraints=(constraints.torque_rows(iiwa, N),)))
+    assert without.bend(model.map.unknowns(motion), 1.0) == 0.0

@@ -15,6 +15,7 @@ from dyngrasp.planning.collocation.residuals import infeasible_at_once, worst_vi
 from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTask, TaskSettings, grasp_targets
 from dyngrasp.planning.problem import Status
+from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.signals import JointState
 from dyngrasp.trajectory import PHASE_NAMES
 
@@ -171,3 +172,26 @@ def test_a_hand_too_slow_for_the_grasp_is_refused_in_numbers(iiwa, sdh2, task, t
 def test_senseless_settings_are_refused(bad):
     with pytest.raises(InvalidProblem, match=next(iter(bad))):
         CollocationSettings(**bad)
+
+
+def test_after_a_small_move_the_old_plan_is_a_good_start(task):
+    planner = CollocationPlanner(task, CollocationSettings(effort_weight=1e-3))
+    random = np.random.default_rng(8)
+    iterations = {"cold": [], "warm": []}
+    for _ in range(6):
+        turn = pin.utils.rotate("z", random.uniform(-np.pi, np.pi))
+        position = np.array([random.uniform(0.6, 0.7), random.uniform(-0.1, 0.1), task.grasp_object.rest_height])
+        before = grasp_targets(pin.SE3(turn, position), task, Q_START)
+        after = updated_targets(before, pin.SE3(turn, position + [0.01, 0.0, 0.0]), task)
+        _, _, old = planner.phase_problems(Q_START, before)
+        _, _, new = planner.phase_problems(Q_START, after)
+        known = planner.solver.solve(old).require()
+        cold, warm = planner.solver.solve(new), planner.solver.solve(new, known)
+        assert cold.ok, cold.message
+        assert warm.ok, warm.message
+        # Both stop within 1e-7 of the same optimum.
+        assert warm.objective == pytest.approx(cold.objective, rel=1e-6)
+        iterations["cold"].append(cold.iterations)
+        iterations["warm"].append(warm.iterations)
+    # The ground is a wall that hardly bends: full steps from the start. Cautious ones take as many as from nothing.
+    assert np.mean(iterations["warm"]) < 0.8 * np.mean(iterations["cold"]), iterations

@@ -105,6 +105,28 @@ class PhaseModel:
         names = [c.name for c, f in zip(self.problem.constraints, self.functions, strict=True) for _ in range(f.rows)]
         return worst, names[row]
 
+    def bend(self, x: Array, T: float) -> float:
+        """How sharply the walls of rows of positions alone bend at the inner grid points, 0 without such rows.
+
+        The length of ∂²Σg over the square of the largest |∂g| at a grid point: by how much the slope of a wall changes,
+        relative to itself, along a step that changes the row by its unit.
+        """
+        self._place(x, T)
+        work, inverse_scale = self.work, self.limits.inverse_scale
+        work.hessian[:], column, slopes = 0.0, 0, []
+        for (_, evaluate), function in zip(self._evaluations, self.functions, strict=True):
+            rows = slice(column, column + function.rows)
+            column += function.rows
+            if function.depends_on_acceleration.any():
+                continue
+            work.weights[:, rows] = inverse_scale[rows]
+            evaluate()
+            slopes.append(((work.jacobian[1:-1, rows] * inverse_scale[rows, None]) ** 2).sum(axis=2))
+        if not slopes:
+            return 0.0
+        steepest = np.concatenate(slopes, axis=1).max(axis=1)
+        return float((np.sqrt((work.hessian[1:-1] ** 2).sum(axis=(1, 2))) / steepest).max())
+
     def derivatives(self, x: Array, T: float, multiplier: Array, g: Array) -> float:
         """As `values`, and prepare everything below for this point and these multipliers."""
         self._place(x, T)

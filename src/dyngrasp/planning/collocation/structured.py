@@ -72,6 +72,7 @@ _WORDS = {
 }
 
 
+BENT = 8.0  # full steps leave walls that bend more sharply; the funnel's bend by 17 and more, the floor's by 4 at most
 TOO_FAST = 1.05  # speed over its limit above which a guess is slowed down
 KEPT = 16  # problem sizes whose arrays are kept
 
@@ -129,9 +130,7 @@ class StructuredSolver:
 
         start = closed_form.within_speed_limits(problem, T) if guess is None else on_grid(problem, guess)
         deadline = began + settings.time_limit
-        # Rows of positions alone are walls, and a guess stands on their right side.
-        cautious = guess is not None and not limits.free_at_ends.all()
-        narrow = self._solve_window(model, g, start, deadline, cautious)
+        narrow = self._solve_window(model, g, start, deadline, guess is not None)
         if narrow is not None:
             trajectory, iterations = narrow
             objective = model.values(model.map.unknowns(trajectory), trajectory.duration, g)
@@ -141,6 +140,8 @@ class StructuredSolver:
                 message = f"{problem.name}: optimal, limits active at the end only"
                 return Solution(Status.CONVERGED, trajectory, objective, iterations, violation, timings, message)
         x, T = model.map.unknowns(start), start.duration
+        # A guess stands on the right side of walls: where they bend, full steps would leave it.
+        cautious = guess is not None and model.bend(x, T) > BENT
         outcome, best, iterations = method.solve(model, x, T, deadline, settings.initial_barrier, cautious)
         if outcome in _UNSOLVED:
             # One in a thousand problems must keep farther from its limits at first; the others are faster so.
@@ -214,10 +215,11 @@ def _refused(
 
 def on_grid(problem: PhaseProblem, guess: Trajectory) -> Trajectory:
     """The guess on the problem's own grid, its boundary states and duration bounds met."""
-    times = np.linspace(0.0, guess.duration, problem.intervals + 1)
     shortest = max(problem.min_duration, min(closed_form.SHORTEST_DURATION, problem.max_duration))
-    duration = float(np.clip(guess.duration, shortest, problem.max_duration))
-    _, _, acceleration = guess.sample_many(times)
+    duration = min(max(guess.duration, shortest), problem.max_duration)
+    acceleration = guess.acceleration
+    if guess.intervals != problem.intervals:
+        _, _, acceleration = guess.sample_many(np.linspace(0.0, guess.duration, problem.intervals + 1))
     curvature = guess.duration**2 * acceleration
     motion = closed_form.nearest_trajectory(problem, curvature, duration)
     # A guess that is too fast keeps its path and takes its time.
