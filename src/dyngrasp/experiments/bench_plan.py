@@ -5,165 +5,36 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from dyngrasp.errors import DyngraspError, GraspRefused, InvalidProblem, OutOfReach
+from dyngrasp.experiments.plan_benchmark import CASES, MOVE, PEERS, SAME, WARM, Attempt, PlanBenchmark, Stage
 from dyngrasp.experiments.serial_chain import serial_chain
 from dyngrasp.experiments.statistics import timing_summary
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.planning import constraints
-from dyngrasp.planning.collocation.ipopt import IpoptSettings
-from dyngrasp.planning.collocation.ipopt_compiled import CompiledIpoptSolver
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.residuals import worst_violation
 from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets
 from dyngrasp.planning.problem import PhaseProblem, PhaseSolver, Solution
+from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import PHASE_NAMES
+
+__all__ = ["CASES", "MOVE", "PEERS", "SAME", "WARM", "Attempt", "PlanBenchmark", "Stage", "bench_plan"]
 
 # The paper's box of poses and start; the target holds the part upright, as in scenarios/static_sdh2.toml.
 BOX_X, BOX_Y = (0.6, 0.7), (-0.1, 0.1)
 START_DEG = (55.0, 39.5, -6.6, -22.0, -36.3, 110.6, 134.0)
 PLACE_DEG = (-45.0, 34.0, 0.0, -53.0, 0.0, 93.0, 90.0)
 
-PEERS: dict[str, tuple[str, Callable[[], PhaseSolver]]] = {
-    "ipopt": (
-        "IPOPT with MUMPS, exact compiled derivatives, the planner's start, mu_init = 1e-4, at most 300 iterations",
-        lambda: CompiledIpoptSolver(IpoptSettings(max_iterations=300)),
-    )
-}
-"""Solvers to compare with: what each is given, and how to make it."""
-
-CASES = {
-    "paper": "the paper's start configuration and box of poses",
-    "stress": "random start postures, half of the torque limits",
-}
-
-WARM = "warm"
-"""The default solver on a problem whose part has moved by `MOVE` (m), from the solution before."""
-MOVE = 0.01
-
-# Objectives that differ by less are those of one optimum (relative).
-SAME = 1e-5
 GRIDS = (50, 100, 200, 400, 800)
 JOINTS = (4, 5, 6, 7, 8, 9)
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One phase of one trial by one solver."""
-
-    case: str
-    weight: float
-    trial: int
-    phase: str
-    solver: str
-    time_ms: float
-    iterations: int
-    objective: float
-    violation: float
-    ok: bool
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Wall time of a part of planning, or of all of it ("plan"), in one trial by the default solver."""
-
-    case: str
-    weight: float
-    trial: int
-    stage: str
-    time_ms: float
-    ok: bool
-
-
-@dataclass(frozen=True)
-class PlanBenchmark:
-    """Everything measured; `table` and `report` condense it."""
-
-    attempts: tuple[Attempt, ...]
-    stages: tuple[Stage, ...]
-    growth: tuple[dict[str, Any], ...]
-    peers: tuple[str, ...]
-
-    def report(self) -> dict[str, Any]:
-        """Summaries for JSON: stages and phases by case and weight, comparisons with peers, growth."""
-        return {
-            "cases": CASES,
-            "peers": {name: PEERS[name][0] for name in self.peers},
-            "stages": self.stage_rows(),
-            "phases": self.phase_rows(),
-            "comparisons": self.comparison_rows(),
-            "growth": list(self.growth),
-        }
-
-    def stage_rows(self) -> list[dict[str, Any]]:
-        """Times of each stage of a whole plan."""
-        groups: dict[tuple, list[Stage]] = {}
-        for stage in self.stages:
-            groups.setdefault((stage.case, stage.weight, stage.stage), []).append(stage)
-        return [
-            {"case": case, "weight": weight, "stage": name, "ok": sum(s.ok for s in group)}
-            | timing_summary([s.time_ms for s in group])
-            for (case, weight, name), group in groups.items()
-        ]
-
-    def phase_rows(self) -> list[dict[str, Any]]:
-        """Times, iterations, objectives and violations of each phase by each solver."""
-        groups: dict[tuple, list[Attempt]] = {}
-        for attempt in self.attempts:
-            groups.setdefault((attempt.case, attempt.weight, attempt.phase, attempt.solver), []).append(attempt)
-        rows = []
-        for (case, weight, phase, solver), group in groups.items():
-            solved = [a for a in group if a.ok]
-            rows.append(
-                {"case": case, "weight": weight, "phase": phase, "solver": solver, "ok": len(solved)}
-                | timing_summary([a.time_ms for a in group])
-                | {
-                    "iterations": float(np.median([a.iterations for a in group])),
-                    "objective": float(np.mean([a.objective for a in solved])) if solved else np.nan,
-                    "worst_violation": max((a.violation for a in solved), default=np.nan),
-                }
-            )
-        return rows
-
-    def comparison_rows(self) -> list[dict[str, Any]]:
-        """The default solver against each peer on the problems that both solved."""
-        by_problem: dict[tuple, dict[str, Attempt]] = {}
-        for a in self.attempts:
-            by_problem.setdefault((a.case, a.weight, a.phase, a.trial), {})[a.solver] = a
-        rows = []
-        for peer in self.peers:
-            groups: dict[tuple, list[tuple[Attempt, Attempt]]] = {}
-            for (case, weight, phase, _), solvers in by_problem.items():
-                if peer in solvers:
-                    groups.setdefault((case, weight, phase), []).append((solvers["structured"], solvers[peer]))
-            for (case, weight, phase), pairs in groups.items():
-                both = [(ours, theirs) for ours, theirs in pairs if ours.ok and theirs.ok]
-                change = np.array([ours.objective / theirs.objective - 1 for ours, theirs in both])
-                rows.append(
-                    {
-                        "case": case,
-                        "weight": weight,
-                        "phase": phase,
-                        "peer": peer,
-                        "problems": len(pairs),
-                        "both": len(both),
-                        "only_ours": sum(ours.ok and not theirs.ok for ours, theirs in pairs),
-                        "only_theirs": sum(theirs.ok and not ours.ok for ours, theirs in pairs),
-                        "same": int((np.abs(change) <= SAME).sum()),
-                        "better": int((change < -SAME).sum()),
-                        "worse": int((change > SAME).sum()),
-                        "speedup": float(np.median([theirs.time_ms / ours.time_ms for ours, theirs in pairs])),
-                    }
-                )
-        return rows
 
 
 def bench_plan(
@@ -301,12 +172,15 @@ def _phases(
 def _after_a_move(
     case: str, weight: float, trial: int, planner: CollocationPlanner, T: pin.SE3, q_start: Array, task: GraspTask
 ) -> list[Attempt]:
-    """The three phases after the part has moved, each from its solution before; nothing if it is then out of reach."""
+    """The three phases after the part has moved and the arm has followed, each from its solution before.
+
+    Nothing if the part is then out of reach.
+    """
     angle = trial * np.pi * (3 - np.sqrt(5))
     moved = pin.SE3(T.rotation, T.translation + MOVE * np.array([np.cos(angle), np.sin(angle), 0.0]))
     before, attempts = grasp_targets(T, task, q_start), []
     try:
-        after = planner.phase_problems(q_start, grasp_targets(moved, task, q_start))
+        after = planner.phase_problems(q_start, updated_targets(before, moved, task))
     except DyngraspError:
         return []
     for phase, problem, new in zip(PHASE_NAMES, planner.phase_problems(q_start, before), after, strict=True):
