@@ -21,8 +21,9 @@ from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targe
 from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.general_solvers import solver_of
 from dyngrasp.planning.replanning.lcqp import end_point_error, sparse_program
+from dyngrasp.planning.replanning.phase_programs import APPROACH, TrackingSettings
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
-from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, rest_of, track
+from dyngrasp.planning.replanning.splice import rest_of, track
 from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingWeights, paper_step, solve_tracking
 from dyngrasp.signals import PoseEstimate

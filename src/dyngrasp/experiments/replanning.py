@@ -19,8 +19,8 @@ from dyngrasp.perception.pose_noise import PoseNoise, PoseNoiseSettings
 from dyngrasp.planning.collocation.planner import CollocationPlanner
 from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.replanning.phase_programs import TrackingSettings
 from dyngrasp.planning.replanning.replanner import Replanner, ReplannerSettings
-from dyngrasp.planning.replanning.splice import TrackingSettings
 from dyngrasp.trajectory import GraspPlan
 
 # Of all random streams of a trial this one belongs to the camera: the others stay what they are without it.

@@ -14,8 +14,9 @@ from dyngrasp.planning.audit import audit
 from dyngrasp.planning.collocation.planner import CollocationPlanner
 from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.problem import Status
+from dyngrasp.planning.replanning.phase_programs import TrackingSettings
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplannerSettings
-from dyngrasp.planning.replanning.splice import TrackingSettings, rest_of
+from dyngrasp.planning.replanning.splice import rest_of
 from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.trajectory import GraspPlan, Trajectory

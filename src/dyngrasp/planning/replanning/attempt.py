@@ -15,7 +15,8 @@ from dyngrasp.planning.problem import AuditReport, PhaseProblem, Status
 from dyngrasp.planning.replanning.full_problem import FullProblem, raised
 from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, funnel_recovery
 from dyngrasp.planning.replanning.outcome import Path, ReplannerSettings, ReplanResult
-from dyngrasp.planning.replanning.splice import APPROACH, DELIVER, GRASP, Candidate, splice_time, track
+from dyngrasp.planning.replanning.phase_programs import APPROACH, DELIVER, GRASP
+from dyngrasp.planning.replanning.splice import Candidate, splice_time, track
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, PlanSample
@@ -53,20 +54,25 @@ class Attempt:
             return self._kept(Status.INFEASIBLE, previous, refusal)
         self.previous = previous
         try:
-            targets = self._targets(previous, estimate)
+            targets, candidate = self._targets(previous, estimate)
         except OutOfReach as error:
             return self._fresh_or_kept(previous, estimate, f"inverse kinematics: {error}")
-        return self.towards(targets, estimate, previous)
+        return self._followed(targets, estimate, candidate)
 
-    def _targets(self, previous: GraspTargets, estimate: PoseEstimate, way: int = 0) -> GraspTargets:
+    def _targets(
+        self, previous: GraspTargets, estimate: PoseEstimate, way: int = 0
+    ) -> tuple[GraspTargets, Candidate | None]:
         """Boundary states for an estimate; a moving part is met when one of the descents brings the hand there.
+
+        Returns:
+            The targets, and for a moving part the candidate that was tracked towards them.
 
         Raises:
             OutOfReach: The posture of the running plan cannot follow the part.
         """
         updater, twist, plan = target_updater(self.task), estimate.twist_world, self.plan
         moving = self._moves(estimate)
-        grasp_time, targets = float(plan.phase_ends[GRASP]), previous
+        grasp_time, targets, candidate = float(plan.phase_ends[GRASP]), previous, None
         for _ in range(8 if moving else 1):
             started = time.perf_counter()
             T = estimate.T_world_object
@@ -87,22 +93,26 @@ class Attempt:
             grasp_time, plan = grasp_time + change, candidate.plan
             if abs(change) * float(np.abs(twist).max()) <= self.settings.settled:
                 break
-        return targets
+        return targets, candidate
 
-    def towards(
-        self, targets: GraspTargets, estimate: PoseEstimate | None = None, previous: GraspTargets | None = None
-    ) -> ReplanResult:
+    def towards(self, targets: GraspTargets, previous: GraspTargets | None = None) -> ReplanResult:
         """See `Replanner.replan`."""
         self.previous = previous
         refusal = self._refusal()
         if refusal:
             return self._kept(Status.INFEASIBLE, targets, refusal)
-        phase = self.plan.phase_at(self.splice)
+        return self._followed(targets, None, None)
+
+    def _followed(
+        self, targets: GraspTargets, estimate: PoseEstimate | None, candidate: Candidate | None
+    ) -> ReplanResult:
+        """All ways towards targets, the first of them tracked already if its candidate is given."""
+        phase, previous = self.plan.phase_at(self.splice), self.previous
         if phase == APPROACH:
-            self.recovery = self._recovery(self.splice, targets)
+            self.recovery = self._recovery(self.state, targets)
             if self.recovery is None:
                 return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
-        status, candidate, best = Status.INFEASIBLE, None, None
+        status, best = Status.INFEASIBLE, None
         # In the grasp, and where the paper's program has no way of its own, one way is all there is.
         ways = len(self.settings.tracking.descents) if phase == APPROACH and self.settings.gate else 1
         for way in range(ways):
@@ -110,16 +120,16 @@ class Attempt:
             if way and estimate is not None and previous is not None and self._moves(estimate):
                 # Another way takes another time, and then the part is elsewhere.
                 try:
-                    aimed = self._targets(previous, estimate, way)
+                    aimed, candidate = self._targets(previous, estimate, way)
                 except OutOfReach:
                     break
-            candidate = self._track(aimed, way)
+            candidate = candidate or self._track(aimed, way)
             self.iterations += candidate.iterations
             status = candidate.status
             if candidate.plan is None:
                 self.reasons.append(f"tracking: {candidate.message}")
                 break
-            best, targets = candidate.plan, aimed
+            best, targets, candidate = candidate.plan, aimed, None
             self.report = self._audited(best, targets)
             if self.report.ok or not self.settings.gate:
                 return self._published(best, targets, Path.TRACKING, self.settings.budget)
@@ -161,9 +171,9 @@ class Attempt:
         self._count("tracking", started)
         return candidate
 
-    def _recovery(self, splice: float, targets: GraspTargets) -> FunnelRecovery | None:
+    def _recovery(self, state: PlanSample, targets: GraspTargets) -> FunnelRecovery | None:
         shares, reaction = self.settings.recovery_shares, self.settings.reaction
-        return funnel_recovery(self.plan, splice, targets, self.task, shares, reaction)
+        return funnel_recovery(self.plan, state, targets, self.task, shares, reaction)
 
     @cached_property
     def _keeps_moving(self) -> bool:
@@ -267,7 +277,7 @@ class Attempt:
         except (OutOfReach, GraspRefused) as error:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
-        recovery = self._recovery(splice, targets)
+        recovery = self._recovery(state, targets)
         fresh, problems, why = None, None, "the hand is beside the part, below the new grasp frame"
         if recovery is not None:
             problems, why = self.full.problems(state, left, targets, recovery)

@@ -16,11 +16,13 @@ from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
+from numba import njit
 
 from dyngrasp.errors import OutOfReach
+from dyngrasp.models.flange_chain import place_frames
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.replanning.target_update import target_updater
-from dyngrasp.signals import Array, read_only
+from dyngrasp.signals import Array, frozen, read_only
 from dyngrasp.trajectory import Trajectory
 
 _KNOTS = 4
@@ -63,52 +65,91 @@ def carried_descent(
     Returns:
         Reference and weights (N+1,) in units of Q_v (1/s⁴); None if the arm cannot follow the carried motion.
     """
-    robot, updater = task.robot, target_updater(task)
+    updater = target_updater(task)
     q_pregrasp = targets.pregrasp.position
-    p_flange_grasp = task.gripper.T_flange_hand.act(task.gripper.grasp_point(targets.gripper_open))
+    chain, T_flange_grasp = task.robot.flange_chain, updater.T_flange_grasp(targets.gripper_open)
     N = reference.intervals
-    old_end = robot.forward_kinematics(reference.position[-1])
-    at_end = robot.forward_kinematics(q_pregrasp) * old_end.inverse()
+    at_end = chain.pose(q_pregrasp) * chain.pose(reference.position[-1]).inverse()
 
     def shift(k: int) -> pin.SE3:
         """Where the carried motion is at a grid point, seen from the old one: parts that move were elsewhere then."""
+        if not (targets.moving or (previous is not None and previous.moving)):
+            return at_end
         now, end = start + k / N * reference.duration, start + reference.duration
         return _since(targets, now, end) * at_end * _since(previous, now, end).inverse()
 
-    axis = old_end.rotation @ updater.outward(targets.gripper_open)
-    lowest = float(axis @ old_end.act(p_flange_grasp)) - task.settings.pregrasp_distance
-    top = lowest + settings.height * task.grasp_object.funnel.z_threshold
-
-    def height(k: int) -> float:
-        return float(axis @ robot.forward_kinematics(reference.position[k]).act(p_flange_grasp))
-
-    above, below = 0, N
-    if height(0) <= top:
-        below = 0
-    while below - above > 1:
-        middle = (above + below) // 2
-        above, below = (middle, below) if height(middle) > top else (above, middle)
+    begin = settings.height * task.grasp_object.funnel.z_threshold - task.settings.pregrasp_distance
+    below = _first_below(
+        chain.rotations, chain.offsets, reference.position, T_flange_grasp.translation, T_flange_grasp.rotation, begin
+    )
     entry = min(max(below, round(settings.earliest * N)), N - _KNOTS)
     knots = _knots(entry, N)
     try:
         carried = [
-            updater.posture(shift(k) * robot.forward_kinematics(reference.position[k]), reference.position[k])
-            for k in knots[:-1]
+            updater.posture(shift(k) * chain.pose(reference.position[k]), reference.position[k]) for k in knots[:-1]
         ]
     except OutOfReach:
         return None
-    difference = np.array([*carried, q_pregrasp]) - reference.position[list(knots)]
-    position, velocity, acceleration = (
-        array.copy() for array in (reference.position, reference.velocity, reference.acceleration)
-    )
-    basis, rate, curvature = _lagrange(entry, N)
-    T = reference.duration
-    position[entry:] += basis @ difference
-    velocity[entry:] += rate @ difference / T
-    acceleration[entry:] += curvature @ difference / T**2
+    T, motion = reference.duration, np.empty((3, N + 1, q_pregrasp.size))
+    difference = np.array([*carried, q_pregrasp])
+    for row, k in zip(difference, knots, strict=True):
+        row -= reference.position[k]
+    old = (reference.position, reference.velocity, reference.acceleration)
+    _bend(old, entry, T, _lagrange(entry, N), difference, motion)
     weights = np.zeros(N + 1)
     weights[entry:] = (settings.stiffness / ((1 - entry / N) * T)) ** 4
-    return Trajectory(T, position, velocity, acceleration), weights
+    return Trajectory(T, *frozen(motion)), weights
+
+
+@njit(cache=True, error_model="numpy")
+def _first_below(rotations, offsets, position, p_flange_grasp, R_flange_grasp, begin):
+    """By bisection, the first grid point of positions (N+1, n) from which G is no higher above its last than `begin`.
+
+    Heights (m) are along the axis of the grasp frame as the hand holds it at the last point.
+    """
+    frames = np.empty((position.shape[1] + 1, 3, 4))
+    place_frames(rotations, offsets, position[-1], frames)
+    axis = np.zeros(3)
+    for a in range(3):
+        for b in range(3):
+            axis[a] += frames[-1, a, b] * R_flange_grasp[b, 2]
+    last = _height(frames[-1], p_flange_grasp, axis)
+    above, below = 0, position.shape[0] - 1
+    place_frames(rotations, offsets, position[0], frames)
+    if _height(frames[-1], p_flange_grasp, axis) - last <= begin:
+        return 0
+    while below - above > 1:
+        middle = (above + below) // 2
+        place_frames(rotations, offsets, position[middle], frames)
+        if _height(frames[-1], p_flange_grasp, axis) - last > begin:
+            above = middle
+        else:
+            below = middle
+    return below
+
+
+@njit(cache=True, error_model="numpy")
+def _height(flange, p_flange_grasp, axis):
+    height = 0.0
+    for a in range(3):
+        height += axis[a] * flange[a, 3]
+        for b in range(3):
+            height += axis[a] * flange[a, b] * p_flange_grasp[b]
+    return height
+
+
+@njit(cache=True, error_model="numpy")
+def _bend(old, entry, T, polynomials, difference, motion):
+    """Write a motion (3, N+1, n): the old one, from `entry` on with polynomials of the given values at the knots."""
+    factor = 1.0
+    for kind in range(3):
+        motion[kind] = old[kind]
+        for k in range(polynomials[kind].shape[0]):
+            for i in range(difference.shape[0]):
+                weight = factor * polynomials[kind][k, i]
+                for j in range(difference.shape[1]):
+                    motion[kind, entry + k, j] += weight * difference[i, j]
+        factor /= T
 
 
 def _since(targets: GraspTargets | None, now: float, end: float) -> pin.SE3:

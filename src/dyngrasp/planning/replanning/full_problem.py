@@ -16,7 +16,8 @@ from dyngrasp.errors import DyngraspError
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import PhaseProblem, PhaseSolver, Solution
 from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, lifted
-from dyngrasp.planning.replanning.splice import APPROACH, TrackingSettings, hold_start, stretched
+from dyngrasp.planning.replanning.phase_programs import APPROACH, TrackingSettings, hold_start
+from dyngrasp.planning.replanning.splice import stretched
 from dyngrasp.signals import Array, JointState
 from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory
 

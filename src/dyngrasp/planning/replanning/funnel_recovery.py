@@ -14,6 +14,7 @@ the audit's clearances to say.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import NodeConstraint
+from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import GraspPlan, PlanSample
 
@@ -66,7 +68,7 @@ class FunnelRecovery:
 
 def funnel_recovery(
     plan: GraspPlan,
-    splice: float,
+    state: PlanSample,
     targets: GraspTargets,
     task: GraspTask,
     shares: tuple[float, float],
@@ -76,16 +78,15 @@ def funnel_recovery(
 
     Args:
         plan: The running plan, in its approach.
-        splice: When the new trajectory takes over (s).
+        state: Of the plan where the new trajectory takes over.
         targets: The new targets.
         task: Arm, gripper, part.
         shares: σ_0 and σ_1.
         reaction: τ (s).
     """
-    factor = 1.0
-    later = min(splice + reaction, float(np.nextafter(plan.phase_ends[0], 0.0)))
-    for t in (splice, later):
-        height, wall = _height_and_wall(plan.sample(t), t, targets, task)
+    factor, end = 1.0, float(plan.phase_ends[0])
+    for now in (state, plan.sample(min(state.arm.t + reaction, math.nextafter(end, 0.0)))):
+        height, wall = _height_and_wall(now, targets, task)
         if height - wall >= _MARGIN:
             continue
         inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
@@ -103,11 +104,11 @@ def lifted(constraint: NodeConstraint, by: Array) -> NodeConstraint:
     return replace(constraint, parameters=parameters)
 
 
-def _height_and_wall(state: PlanSample, t: float, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
+def _height_and_wall(state: PlanSample, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
     """Height of G in the grasp frame and that of the wall below or above it, eq. (5) (m)."""
-    gripper, funnel = task.gripper, task.grasp_object.funnel
-    T_hand = task.robot.forward_kinematics(state.arm.position) * gripper.T_flange_hand
-    G = T_hand.act(gripper.grasp_point(state.gripper.position))
-    x, y, z = (targets.T_world_object_at(t) * targets.grasp.T_object_grasp).actInv(G)
-    bell = np.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
-    return float(z), float(funnel.z_threshold * (1.0 - bell))
+    funnel = task.grasp_object.funnel
+    T_flange_grasp = target_updater(task).T_flange_grasp(state.gripper.position)
+    G = task.robot.flange_chain.pose(state.arm.position).act(T_flange_grasp.translation)
+    x, y, z = (targets.T_world_object_at(state.arm.t) * targets.grasp.T_object_grasp).actInv(G).tolist()
+    bell = math.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
+    return z, funnel.z_threshold * (1.0 - bell)

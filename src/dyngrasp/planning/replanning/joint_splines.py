@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dyngrasp.signals import Array
 
 Indices = NDArray[np.int64]
+Motion = tuple[Array, Array, Array]  # q, q̇, q̈, each (N+1, n)
 
 POSITION, RATE, CURVATURE = 0, 1, 2
 TAPS = 3
@@ -72,20 +73,22 @@ def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -
 
 
 @njit(cache=True, error_model="numpy")
-def boundary(T: float, T_ref: float, ends: Array, reference: Array, linear: bool, values: Array, slopes: Array) -> None:
+def boundary(
+    T: float, T_ref: float, ends: Array, reference: Motion, linear: bool, values: Array, slopes: Array
+) -> None:
     """Write q, w, a at both ends and their derivatives by T, both (2, 3, n).
 
     Exactly they are q, T q̇, T² q̈ of `ends` (2, 3, n). The paper's program knows them to first order about the
-    reference (3, N+1, n): T* q̇ + q̇* (T − T*) and T*² q̈ + 2 T* v* (T − T*).
+    reference: T* q̇ + q̇* (T − T*) and T*² q̈ + 2 T* v* (T − T*).
     """
     for end in range(2):
-        k = 0 if end == 0 else reference.shape[1] - 1
+        k = 0 if end == 0 else -1
         for j in range(ends.shape[2]):
             q, rate, curvature = ends[end, 0, j], ends[end, 1, j], ends[end, 2, j]
             values[end, 0, j], slopes[end, 0, j] = q, 0.0
             if linear:
-                slopes[end, 1, j] = reference[1, k, j]
-                slopes[end, 2, j] = 2 * T_ref * reference[2, k, j]
+                slopes[end, 1, j] = reference[1][k, j]
+                slopes[end, 2, j] = 2 * T_ref * reference[2][k, j]
                 values[end, 1, j] = T_ref * rate + slopes[end, 1, j] * (T - T_ref)
                 values[end, 2, j] = T_ref * T_ref * curvature + slopes[end, 2, j] * (T - T_ref)
             else:

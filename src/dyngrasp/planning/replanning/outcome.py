@@ -8,7 +8,7 @@ from enum import StrEnum
 from dyngrasp.errors import InvalidProblem, PlanningFailed
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.problem import AuditReport, Status
-from dyngrasp.planning.replanning.splice import TrackingSettings
+from dyngrasp.planning.replanning.phase_programs import TrackingSettings
 from dyngrasp.trajectory import GraspPlan
 
 

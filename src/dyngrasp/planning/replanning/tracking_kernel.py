@@ -6,12 +6,13 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect, least_row
-from dyngrasp.planning.replanning.interior_point import INFEASIBLE, OPTIMAL, interior_point
+from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     POSITION,
     RATE,
     TAPS,
     Indices,
+    Motion,
     boundary,
     factorise,
     filtered,
@@ -47,7 +48,7 @@ def distinct(codes: Indices) -> int:
 
 @njit(cache=True, error_model="numpy")
 def solve(
-    reference: Array,
+    reference: Motion,
     T_ref: float,
     ends: Array,
     held: tuple[bool, bool],
@@ -69,7 +70,7 @@ def solve(
     """Minimise ½ Σ_k Σ_j Q_q δq² + Q_q̇ δq̇² + Q_v δv² + ½ Σ_k Q_ΔT δT² between two boundary states, within boxes.
 
     Args:
-        reference: (3, K, n) q*, q̇*, v*.
+        reference: q*, q̇*, v*, each (K, n).
         T_ref: ΔT* (s).
         ends: (2, 3, n) position, velocity, acceleration at both ends.
         held: Whether the acceleration is given at the start and at the end.
@@ -77,7 +78,7 @@ def solve(
         node_weights: (K,) added to Q_q at each grid point.
         duration_weight: Q_ΔT of one grid point.
         ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
-        boxes: (4, n) q_min, q_max, q̇_max, v_max.
+        boxes: (4, n) q_min, q_max, q̇_max, v_max, clipped to what `box_rows` takes for unbounded.
         paper_rows: The boxes of eq. (13c), which are linear about the reference, instead of the exact ones.
         duration: Bounds of T (s); equal ones fix it.
         first: Of `filters`.
@@ -91,7 +92,8 @@ def solve(
     Returns:
         Outcome, T, iterations of the interior point method, number of rows imposed.
     """
-    _, K, n = reference.shape
+    K, n = reference[0].shape
+    boxes[:] = np.minimum(np.maximum(boxes, -UNBOUNDED), UNBOUNDED)
     size = K - 2
     free_T = duration[1] - duration[0] > 1e-12
     T = min(max(T_ref, duration[0]), duration[1])
@@ -124,7 +126,7 @@ def solve(
     for i in range(size):
         k = 0 if i == 0 else (K - 1 if i == size - 1 else i + 1)
         for j in range(n):
-            x[i, j] = reference[0, k, j] - h2 / 4 * T_ref * T_ref * reference[2, k, j]
+            x[i, j] = reference[0][k, j] - h2 / 4 * T_ref * T_ref * reference[2][k, j]
 
     dual, dual_by_T, weight = np.empty((K, n)), np.empty((K, n)), np.empty((K, n))
     gradient, column, solved = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
@@ -239,6 +241,8 @@ def solve(
         boundary(T, T_ref, ends, reference, False, values, slopes)
         sequence(x, values, held, r)
         filtered(r, z)
+    if outcome == OPTIMAL and not (0.0 < T < np.inf and product(z, z) < np.inf):
+        outcome = NONFINITE
     return outcome, T, iterations, count
 
 
@@ -280,7 +284,7 @@ def _duals(
 
 
 @njit(cache=True, error_model="numpy")
-def _errors(reference: Array, T: float, T_ref: float, z: Array, slope: Array, error: Array, by_T: Array) -> None:
+def _errors(reference: Motion, T: float, T_ref: float, z: Array, slope: Array, error: Array, by_T: Array) -> None:
     """Write the deviations of q, w, a (3, N+1, n) and their derivatives by T."""
     for kind in range(3):
         factor, factor_by_T = _of_reference(kind, T, T_ref)

@@ -20,10 +20,9 @@ import numpy as np
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.planning.problem import MIN_INTERVALS, Status
 from dyngrasp.planning.replanning import tracking_kernel
-from dyngrasp.planning.replanning.box_rows import UNBOUNDED
 from dyngrasp.planning.replanning.interior_point import INFEASIBLE, ITERATION_LIMIT, NONFINITE, OPTIMAL
 from dyngrasp.planning.replanning.joint_splines import Indices, filters
-from dyngrasp.signals import Array
+from dyngrasp.signals import Array, frozen
 from dyngrasp.trajectory import Trajectory
 
 
@@ -123,16 +122,17 @@ class TrackingSolution:
         if problem.paper_rows:
             return paper_update(problem.reference, paper_step(problem, self))
         T = self.duration
-        position = self.scaled[0].copy()
-        velocity, acceleration = self.scaled[1] / T, self.scaled[2] / T**2
+        motion = np.empty_like(self.scaled)
+        motion[0] = self.scaled[0]
+        np.multiply(self.scaled[1], 1 / T, out=motion[1])
+        np.multiply(self.scaled[2], 1 / T**2, out=motion[2])
         for k, state, held in (
             (0, problem.start, problem.hold_start_acceleration),
             (-1, problem.end, problem.hold_end_acceleration),
         ):
-            position[k], velocity[k] = state[0], state[1]
-            if held:
-                acceleration[k] = state[2]
-        return Trajectory(T, position, velocity, acceleration)
+            given = 3 if held else 2
+            motion[:given, k] = state[:given]
+        return Trajectory(T, *frozen(motion))
 
 
 _STATUS = {
@@ -155,8 +155,6 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
     began = time.perf_counter()
     reference = problem.reference
     N, n = reference.intervals, reference.position.shape[1]
-    motion = np.empty((3, N + 1, n))
-    motion[0], motion[1], motion[2] = reference.position, reference.velocity, reference.acceleration
     ends = np.empty((2, 3, n))
     ends[0], ends[1] = problem.start, problem.end
     held = (problem.hold_start_acceleration, problem.hold_end_acceleration)
@@ -165,13 +163,12 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
     boxes = np.empty((4, n))
     boxes[0], boxes[1] = problem.position_lower, problem.position_upper
     boxes[2], boxes[3] = problem.velocity_limit, problem.acceleration_limit
-    np.clip(boxes, -UNBOUNDED, UNBOUNDED, out=boxes)
     first, taps, bands = filters(N, *held, not problem.paper_rows)
     scaled = np.empty((3, N + 1, n))
     codes = np.empty(12 * (N + 1) * n, dtype=np.int64)
     multipliers = np.empty(codes.size + 2)
     outcome, duration, iterations, count = tracking_kernel.solve(
-        motion,
+        (reference.position, reference.velocity, reference.acceleration),
         reference.duration,
         ends,
         held,
@@ -190,12 +187,9 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
         codes,
         multipliers,
     )
-    status = _STATUS[outcome]
-    if not (np.isfinite(duration) and duration > 0 and np.isfinite(scaled).all()):
-        status = Status.NONFINITE
     elapsed = 1e3 * (time.perf_counter() - began)
     return TrackingSolution(
-        status, duration, scaled, iterations, codes[:count].copy(), multipliers[: count + 2].copy(), elapsed
+        _STATUS[outcome], duration, scaled, iterations, codes[:count].copy(), multipliers[: count + 2].copy(), elapsed
     )
 
 
