@@ -15,7 +15,7 @@ from dyngrasp.errors import InvalidProblem, RenderingUnavailable
 from dyngrasp.experiments.draws import draw_trial, trial_seed
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.experiments.trial import plan_trial, planner_for
-from dyngrasp.experiments.trial_summary import summary
+from dyngrasp.experiments.trial_summary import study_row, summary
 from dyngrasp.experiments.trial_world import first_look, trial_world
 from dyngrasp.experiments.vision import recorded_poses
 from dyngrasp.experiments.workcell import load_workcell
@@ -124,6 +124,7 @@ def test_a_part_that_is_not_seen_is_an_outcome(command, tmp_path, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     assert "first look: the part was not found within 0.1 s" in printed
     if command == "run":
+        assert "First look 0.10 s 3 pictures, 0 with markers" in printed
         document = json.loads((tmp_path / "out" / "summary.json").read_text())
         assert not document["success"]
         assert document["cause"].startswith("first look:")
@@ -131,3 +132,14 @@ def test_a_part_that_is_not_seen_is_an_outcome(command, tmp_path, capsys):
         # What it looked at is there to be looked at.
         assert (tmp_path / "out" / "pictures" / "0000.png").exists()
         assert not (tmp_path / "out" / "plan.json").exists()
+
+
+def test_a_part_that_is_not_seen_is_a_row_of_a_study():
+    rendered()
+    cell = workcell(CAMERA, "part.x_m=-0.6", "camera.look_s=0.1")
+    row = study_row(cell, draw_trial(cell, 1), planner_for(cell))
+    assert row["success"] is False
+    assert row["cause"].startswith("first look:")
+    assert (row["look_frames"], row["look_deviation_mm"]) == (3, None)
+    assert row["look_s"] == pytest.approx(0.1, abs=1e-9)
+    assert "error_deg" not in row
