@@ -44,9 +44,9 @@ _pose: dict[str, Any] = {
     "choices": tuple(_POSES),
     "dest": "overrides",
     "default": [],
-    "help": "where the pose of the part comes from: pictures of the camera on the hand, from a first look on, which has "
-    "to see the part from task.start_deg (table [camera], defaults without one); a noise model; or the truth, without "
-    "the scenario's errors. Short for --set pose.source=…",
+    "help": "where the pose of the part comes from: pictures of the camera on the hand, from a first look on, which "
+    "has to see the part from task.start_deg (table [camera], defaults without one); a noise model; or the truth, "
+    "without the scenario's errors. Short for --set pose.source=…",
 }
 
 
