@@ -167,7 +167,8 @@ def test_impossible_settings_are_refused(kind, settings):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "replanning"), [("camera_sdh2", True), ("camera_sdh2", False), ("conveyor_camera_sdh2", True)]
+    ("name", "replanning"),
+    [("camera_sdh2", True), ("camera_sdh2", False), ("relocated_sdh2", True), ("conveyor_camera_sdh2", True)],
 )
 def test_the_paper_from_pictures(stage, name, replanning):
     from dyngrasp.experiments.draws import draw_trial

@@ -31,7 +31,7 @@ class EpisodeRecord:
     Attributes:
         arm_joints, gripper_joints: Names.
         t: (K,) times.
-        phase: (K,) index of the plan's phase.
+        phase: (K,) index of the plan's phase; that of the approach also while the arm waits for a first look.
         arm_planned, arm_planned_velocity: (K, n) what the plan asked for.
         arm_measured: (K, n) encoder positions.
         arm_filtered_velocity: (K, n) their velocities through the differential filter.
