@@ -8,9 +8,10 @@ from dyngrasp.planning import constraints
 from dyngrasp.planning.collocation.closed_form import least_effort
 from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import node_functions
-from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
+from dyngrasp.planning.collocation.phase_model import PhaseModel
 from dyngrasp.planning.collocation.residuals import worst_violation
 from dyngrasp.planning.collocation.three_tap import ThreeTap
+from dyngrasp.planning.collocation.work_arrays import WorkArrays
 from dyngrasp.planning.problem import NodeConstraint
 
 STEP = 1e-6
@@ -21,8 +22,8 @@ DIFFERENCE = 1e-6
 def model_of(problem) -> PhaseModel:
     functions = [node_functions(constraint) for constraint in problem.constraints]
     limits = LimitRows.of(problem, functions)
-    size = (problem.intervals + 1, problem.joints, limits.constraint_rows, limits.rows_per_point)
-    return PhaseModel(problem, functions, limits, WorkArrays(*size))
+    work = WorkArrays.of(problem.intervals + 1, problem.joints, limits.constraint_rows)
+    return PhaseModel(problem, functions, limits, work)
 
 
 def position_row(n: int, N: int) -> NodeConstraint:
@@ -89,7 +90,8 @@ def test_steps_of_rows(case):
     assert model.factorise(np.ones(model.rows), multiplier, 0.0, 50.0)
     random, rhs, dx = np.random.default_rng(6), np.empty_like(x), np.empty_like(x)
     for y in random.normal(size=(5, model.rows)):
-        dT, by_T, product = model.newton_step(y, rhs, dx, dg, np.inf)
+        by_T = model.descent(y, rhs)
+        dT, product = model.newton_step(y, dx, dg, np.inf)
         step = np.append(dx.ravel(), dT)
         np.testing.assert_allclose(dg, jacobian @ step, atol=DIFFERENCE * np.abs(jacobian).max() * np.abs(step).max())
         assert product == pytest.approx(rhs.ravel() @ dx.ravel() + by_T * dT)
@@ -159,8 +161,8 @@ def test_slope_of_the_objective_along_a_step(case):
     objective = model.derivatives(x, T, multiplier, g)
     assert model.factorise(omega, multiplier, 0.0, 0.0)
     model.complement = max(model.complement, 1.0)
-    dx, rhs, dg = np.empty_like(x), np.empty_like(x), np.empty(model.rows)
-    dT, _, _ = model.newton_step(multiplier, rhs, dx, dg, 0.5 * T)
+    dx, dg = np.empty_like(x), np.empty(model.rows)
+    dT, _ = model.newton_step(multiplier, dx, dg, 0.5 * T)
     slope = model.objective_slope(dT)
     ahead, behind = (model.values(x + step * dx, T + step * dT, g) for step in (STEP, -STEP))
     np.testing.assert_allclose((ahead - behind) / (2 * STEP), slope, atol=DIFFERENCE * max(abs(objective), 1.0))

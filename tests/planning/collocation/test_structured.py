@@ -19,9 +19,10 @@ from dyngrasp.planning.collocation.interior_point import InteriorPoint
 from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
 from dyngrasp.planning.collocation.iterates import InteriorPointSettings, Outcome
 from dyngrasp.planning.collocation.limit_rows import LimitRows
-from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
+from dyngrasp.planning.collocation.phase_model import PhaseModel
 from dyngrasp.planning.collocation.residuals import objective, worst_violation
 from dyngrasp.planning.collocation.structured import StructuredSettings, StructuredSolver
+from dyngrasp.planning.collocation.work_arrays import WorkArrays
 from dyngrasp.planning.problem import NodeConstraint, PhaseProblem, Status
 from dyngrasp.trajectory import Trajectory
 
@@ -149,7 +150,7 @@ def test_the_method_itself_finds_the_closed_form(make_problem, N, adaptive):
     """Started far from the answer, with the short cut left out; both ways of choosing the barrier parameter."""
     problem = make_problem(1, intervals=N, velocity_limit=np.full(7, 1e3), position_upper=np.full(7, 50.0))
     limits = LimitRows.of(problem, [])
-    work = WorkArrays(N + 1, 7, limits.constraint_rows, limits.rows_per_point)
+    work = WorkArrays.of(N + 1, 7, limits.constraint_rows)
     model = PhaseModel(problem, [], limits, work)
     start = least_effort(problem, 3 * best_duration(problem))
     method = InteriorPoint(InteriorPointSettings(adaptive=adaptive))
@@ -237,7 +238,7 @@ def test_monotone_mode_alone_reaches_the_same_optimum(structured, iiwa, seed):
     problem = between_postures(iiwa, seed, N=30)
     functions = [node_functions.node_functions(constraint) for constraint in problem.constraints]
     limits = LimitRows.of(problem, functions)
-    model = PhaseModel(problem, functions, limits, WorkArrays(31, 7, limits.constraint_rows, limits.rows_per_point))
+    model = PhaseModel(problem, functions, limits, WorkArrays.of(31, 7, limits.constraint_rows))
     start = least_effort(problem, 2.0)
     method = InteriorPoint(InteriorPointSettings(adaptive=False))
     outcome, best, _ = method.solve(model, model.map.unknowns(start), 2.0)

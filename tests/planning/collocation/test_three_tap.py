@@ -46,8 +46,8 @@ def test_steps_and_pull_back_are_the_linear_map_and_its_transpose(make_problem, 
     tap = ThreeTap.of(make_problem(N, joints=2, intervals=N))
     x, dx, T, dT = random.normal(size=(N - 1, 2)), random.normal(size=(N - 1, 2)), 1.1, 0.4
     dz = np.empty((3, N + 1, 2))
-    three_tap.expand_step(tap.first, tap.taps, tap.slope, dx, dT, dz)
+    three_tap.expand_step(tap, dx, dT, dz)
     np.testing.assert_allclose(dz, tap.expand(x + dx, T + dT) - tap.expand(x, T), atol=tolerance(N) * N**2)
     dual, gradient = random.normal(size=dz.shape), np.empty_like(dx)
-    by_T = three_tap.pull_back(tap.first, tap.taps, tap.slope, dual, gradient)
+    by_T = three_tap.pull_back(tap, dual, gradient)
     assert np.vdot(dual, dz) == pytest.approx(np.vdot(gradient, dx) + by_T * dT, rel=1e-10)

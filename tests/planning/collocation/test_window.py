@@ -10,12 +10,13 @@ from dyngrasp.planning import constraints
 from dyngrasp.planning.collocation.closed_form import least_effort, nearest_trajectory
 from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import node_functions
-from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
+from dyngrasp.planning.collocation.phase_model import PhaseModel
 from dyngrasp.planning.collocation.planner import CollocationPlanner
 from dyngrasp.planning.collocation.residuals import objective
 from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, ThreeTap
 from dyngrasp.planning.collocation.window import STANDING_FOR, Window
+from dyngrasp.planning.collocation.work_arrays import WorkArrays
 
 N, FIRST = 30, 12
 
@@ -47,7 +48,7 @@ def test_a_window_costs_what_the_whole_motion_costs(problem, window):
     x = x + 1e-3 * random.normal(size=x.shape)
     functions = [node_functions(constraint) for constraint in problem.constraints]
     limits = LimitRows.without_boxes(problem, problem.constraints, functions)
-    work = WorkArrays(window.map.first.size, 7, limits.constraint_rows, limits.rows_per_point)
+    work = WorkArrays.of(window.map.first.size, 7, limits.constraint_rows)
     model = PhaseModel(problem, functions, limits, work, window)
     cost = model.values(x, T, np.empty(model.rows))
     # The unknowns meet the boundary states whatever they are, so that the accelerations need no correction.

@@ -64,7 +64,7 @@ class InteriorPoint:
         if size == self._size:
             return
         self._size = size
-        self.x, self.dx, self.x_new, self.rhs = (np.zeros(x.shape) for _ in range(4))
+        self.x, self.dx, self.x_new = (np.zeros(x.shape) for _ in range(3))
         M = model.rows
         self.s, self.t, self.multiplier, self.ds, self.dt, self.dmultiplier = (np.zeros(M) for _ in range(6))
         self.g, self.dg, self.omega, self.y, self.e_s, self.e_t = (np.zeros(M) for _ in range(6))
@@ -255,7 +255,7 @@ class InteriorPoint:
         pair = (self.s, self.t, self.multiplier, self.price)
         aim = (mu, self.e_s, self.e_t, self.omega, self.y)
         rows.target_multipliers(*pair, *aim)
-        self.dT, _, product = model.newton_step(self.y, self.rhs, self.dx, self.dg, LARGEST_CHANGE * self.T)
+        self.dT, product = model.newton_step(self.y, self.dx, self.dg, LARGEST_CHANGE * self.T)
         rows.row_direction(self.dg, *pair, *aim, self.ds, self.dt, self.dmultiplier)
         return product
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -44,7 +45,7 @@ class LimitRows:
         free_at_ends: (m,) 1.0 where a row depends on v, so that it is not constant at the ends.
         shortest, longest: Bounds of T (s).
         fixed_duration: Whether they leave T no freedom.
-        names: What each of the R rows of a grid point limits, and at last the duration.
+        of_row: Names of the constraints that the m rows belong to.
     """
 
     middle: Array
@@ -60,7 +61,7 @@ class LimitRows:
     shortest: float
     longest: float
     fixed_duration: bool
-    names: tuple[str, ...]
+    of_row: tuple[str, ...]
 
     @classmethod
     def of(cls, problem: PhaseProblem, functions: list[NodeFunctions]) -> LimitRows:
@@ -95,13 +96,6 @@ class LimitRows:
         widening = np.maximum(0.0, NARROWEST - (upper - lower)) / 2
         free = np.concatenate([f.depends_on_acceleration for f in functions] or none)
         lower_index, upper_index = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
-        of_row = [c.name for c in constraints for _ in range(c.lower.size)]
-        names = (
-            2 * velocity.size * ["position"]
-            + 2 * velocity.size * ["velocity"]
-            + 2 * acceleration.size * ["acceleration"]
-        )
-        names += [of_row[i] for i in (*lower_index, *upper_index)]
         shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
         return cls(
             (q_max + q_min) / 2,
@@ -117,8 +111,15 @@ class LimitRows:
             shortest,
             problem.max_duration,
             problem.max_duration - shortest <= NARROWEST * problem.max_duration,
-            (*names, "duration"),
+            tuple(c.name for c in constraints for _ in range(c.lower.size)),
         )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """What each of the R rows of a grid point limits, and at last the duration."""
+        boxes = 2 * self.velocity.size * ("position",) + 2 * self.velocity.size * ("velocity",)
+        boxes += 2 * self.acceleration.size * ("acceleration",)
+        return (*boxes, *(self.of_row[i] for i in (*self.lower_index, *self.upper_index)), "duration")
 
     @property
     def constraint_rows(self) -> int:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, TAPS, Indices
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, RATE, TAPS, ThreeTap
+from dyngrasp.planning.collocation.work_arrays import WorkArrays
 from dyngrasp.signals import Array
 
 
@@ -51,47 +52,35 @@ def add_objective_gradient(a: Array, T: float, rho: float, factor: float, dual: 
 
 @njit(cache=True, error_model="numpy")
 def assemble(
-    z: Array,
+    work: WorkArrays,
     T: float,
-    v: Array,
+    tap: ThreeTap,
+    limits: tuple,
     omega: Array,
     multiplier: Array,
-    weights: Array,
-    jacobian: Array,
-    hessian: Array,
-    limits: tuple,
     rho: float,
     factor: float,
     curvature: float,
     shift: float,
-    first: Indices,
-    taps: Array,
-    slope: Array,
-    band: Array,
     column: Array,
 ) -> float:
-    """Write the band and the column of T; return the corner.
+    """Write the band in `work` and the column of T; return the corner.
 
     Args:
-        z: (3, K, n) q, w, a.
-        T: Duration (s).
-        v: (K, n) a / T².
+        work: The present point with the derivatives of the rows.
+        T: Duration there (s).
+        tap: The map to q, w, a.
+        limits: `LimitRows.arguments`.
         omega: (K · R + 2,) Ω of the one-sided rows.
         multiplier: (K · R + 2,) λ of the same.
-        weights: (K, m) from `limit_rows.constraint_weights` of λ.
-        jacobian: (K, m, 2n) derivatives of c by (q, v).
-        hessian: (K, 2n, 2n) second derivatives of Σ weights · c by (q, v).
-        limits: `LimitRows.arguments`.
         rho: Weight of the effort.
         factor: Weight of the objective, 1, or 0 where only the violation counts.
         curvature: Part of the second derivatives of the rows to take, 1, or 0 for Gauss and Newton's matrix.
         shift: Multiple of the identity added to the second derivatives by a: the inertia correction.
-        first: The map of `ThreeTap`, and so are the next two.
-        taps: (K, 3, 3)
-        slope: (3, K, n)
-        band: ((K−2) n, 3n), overwritten; layout as in `banded`.
         column: ((K−2) n,), overwritten.
     """
+    z, v, weights, jacobian, hessian, band = work.z, work.v, work.weights, work.jacobian, work.hessian, work.band
+    first, taps, _, slope = tap
     _, half_width, velocity, acceleration, lo, up, _, _, scale, free, _, longest, fixed = limits
     _, K, n = z.shape
     m = jacobian.shape[1]

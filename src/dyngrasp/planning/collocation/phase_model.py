@@ -8,31 +8,11 @@ from numba import njit
 from dyngrasp.planning.collocation import banded, limit_rows, newton_matrix, three_tap
 from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import NodeFunctions
-from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, Indices, ThreeTap
+from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, ThreeTap
 from dyngrasp.planning.collocation.window import Window
+from dyngrasp.planning.collocation.work_arrays import WorkArrays
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
-
-
-class WorkArrays:
-    """Memory of one problem structure, used again by every problem that shares it.
-
-    Args:
-        points: K = N + 1.
-        joints: n.
-        constraint_rows: m, rows c of the constraints at a grid point.
-        rows_per_point: R, one-sided rows at a grid point.
-    """
-
-    def __init__(self, points: int, joints: int, constraint_rows: int, rows_per_point: int) -> None:
-        K, n, m = points, joints, constraint_rows
-        self.rows = K * rows_per_point + 2
-        unknowns = (K - 2) * n
-        self.z, self.dz, self.dual = (np.zeros((3, K, n)) for _ in range(3))
-        self.v = np.zeros((K, n))
-        self.c, self.weights, self.y_weights = (np.zeros((K, m)) for _ in range(3))
-        self.jacobian, self.hessian = np.zeros((K, m, 2 * n)), np.zeros((K, 2 * n, 2 * n))
-        self.band, self.column, self.solved_column = np.zeros((unknowns, 3 * n)), np.zeros(unknowns), np.zeros(unknowns)
 
 
 class PhaseModel:
@@ -77,11 +57,10 @@ class PhaseModel:
     @property
     def rows(self) -> int:
         """Number of one-sided rows."""
-        return self.work.rows
+        return self.work.v.shape[0] * self.limits.rows_per_point + 2
 
     def _place(self, x: Array, T: float) -> None:
-        work, tap = self.work, self.map
-        three_tap.place(tap.first, tap.taps, tap.offset, tap.slope, x, T, work.z, work.v)
+        three_tap.place(self.map, x, T, self.work.z, self.work.v)
         self._T = T
 
     def values(self, x: Array, T: float, g: Array) -> float:
@@ -139,93 +118,33 @@ class PhaseModel:
 
     def descent(self, y: Array, out: Array) -> float:
         """Write −∇f + Jᵀ y by x into `out` (N−1, n), return it by T."""
-        work, tap = self.work, self.map
-        return _descent(
-            y,
-            self._T,
-            work.z,
-            work.v,
-            work.jacobian,
-            self._arguments,
-            self.effort_weight,
-            self.factor,
-            tap.first,
-            tap.taps,
-            tap.slope,
-            work.y_weights,
-            work.dual,
-            out,
-        )
+        return _descent(y, self._T, self.work, self.map, self._arguments, self.effort_weight, self.factor, out)
 
     def objective_slope(self, dT: float) -> float:
         """Derivative of the weighted objective along the step that `newton_step` found last; dT is its change of T."""
         work, rho = self.work, self.effort_weight
         return self.factor * newton_matrix.objective_slope(work.z[CURVATURE], work.dz[CURVATURE], self._T, dT, rho)
 
-    def newton_step(self, y: Array, rhs: Array, dx: Array, dg: Array, longest: float) -> tuple[float, float, float]:
+    def newton_step(self, y: Array, dx: Array, dg: Array, longest: float) -> tuple[float, float]:
         """The step of the factorised system for multipliers y, and how the rows change with it.
 
         Args:
             y: (K · R + 2,) multipliers after the step if the rows stayed as they are.
-            rhs: (N−1, n), overwritten by −∇f + Jᵀ y by x.
             dx: (N−1, n), overwritten by the step.
             dg: (K · R + 2,), overwritten by J d.
             longest: A step of T beyond it is cut to that and dx solved for it: as if the corner had been larger.
 
         Returns:
-            dT, the right-hand side by T, and the product of right-hand side and step.
+            dT, and the product of the step with the right-hand side −∇f + Jᵀ y.
         """
-        work, tap = self.work, self.map
-        return _newton_step(
-            y,
-            self._T,
-            work.z,
-            work.v,
-            work.jacobian,
-            self._arguments,
-            self.effort_weight,
-            self.factor,
-            tap.first,
-            tap.taps,
-            tap.slope,
-            work.band,
-            work.solved_column,
-            self.complement,
-            longest,
-            work.y_weights,
-            work.dual,
-            work.dz,
-            rhs,
-            dx,
-            dg,
-        )
+        model = (self.work, self.map, self._arguments, self.effort_weight, self.factor)
+        return _newton_step(y, self._T, *model, self.complement, longest, dx, dg)
 
     def factorise(self, omega: Array, multiplier: Array, curvature: float, shift: float) -> bool:
         """Assemble and factorise H + Jᵀ Ω J + shift · ∂²|a|²/2; whether the banded part is positive definite."""
-        work, tap = self.work, self.map
-        definite, self.corner, self.complement = _factorise(
-            (
-                work.z,
-                self._T,
-                work.v,
-                omega,
-                multiplier,
-                work.weights,
-                work.jacobian,
-                work.hessian,
-                self._arguments,
-                self.effort_weight,
-                self.factor,
-                curvature,
-                shift,
-                tap.first,
-                tap.taps,
-                tap.slope,
-                work.band,
-                work.column,
-            ),
-            work.solved_column,
-        )
+        model = (self.work, self._T, self.map, self._arguments)
+        weights = (omega, multiplier, self.effort_weight, self.factor, curvature, shift)
+        definite, self.corner, self.complement = _factorise(*model, *weights)
         return definite
 
     def solve(self, x: Array, by_T: float) -> float:
@@ -241,13 +160,24 @@ def _rows_and_objective(z: Array, T: float, c: Array, limits: tuple, rho: float,
 
 
 @njit(cache=True, error_model="numpy")
-def _factorise(system: tuple, solved_column: Array) -> tuple[bool, float, float]:
+def _factorise(
+    work: WorkArrays,
+    T: float,
+    tap: ThreeTap,
+    limits: tuple,
+    omega: Array,
+    multiplier: Array,
+    rho: float,
+    factor: float,
+    curvature: float,
+    shift: float,
+) -> tuple[bool, float, float]:
     """Whether the banded part is positive definite, the corner, and its Schur complement."""
-    corner = newton_matrix.assemble(*system)
-    band, column = system[-2], system[-1]
-    if not banded.cholesky(band):
+    column = np.empty(work.solved_column.size)
+    corner = newton_matrix.assemble(work, T, tap, limits, omega, multiplier, rho, factor, curvature, shift, column)
+    if not banded.cholesky(work.band):
         return False, corner, np.nan
-    complement = banded.schur_complement(band, column, corner, solved_column)
+    complement = banded.schur_complement(work.band, column, corner, work.solved_column)
     return bool(np.isfinite(complement)), corner, complement
 
 
@@ -271,58 +201,36 @@ def _solve(
 def _newton_step(
     y: Array,
     T: float,
-    z: Array,
-    v: Array,
-    jacobian: Array,
+    work: WorkArrays,
+    tap: ThreeTap,
     limits: tuple,
     rho: float,
     factor: float,
-    first: Indices,
-    taps: Array,
-    slope: Array,
-    band: Array,
-    solved_column: Array,
     complement: float,
     longest: float,
-    y_weights: Array,
-    dual: Array,
-    dz: Array,
-    rhs: Array,
     dx: Array,
     dg: Array,
-) -> tuple[float, float, float]:
-    by_T = _descent(y, T, z, v, jacobian, limits, rho, factor, first, taps, slope, y_weights, dual, rhs)
+) -> tuple[float, float]:
+    rhs = np.empty(dx.shape)
+    by_T = _descent(y, T, work, tap, limits, rho, factor, rhs)
     dx[:] = rhs
     fixed = limits[-1]
-    dT = _solve(band, solved_column, complement, dx, by_T, longest, fixed)
-    three_tap.expand_step(first, taps, slope, dx, dT, dz)
-    limit_rows.row_steps(dz, dT, T, v, jacobian, limits, dg)
+    dT = _solve(work.band, work.solved_column, complement, dx, by_T, longest, fixed)
+    three_tap.expand_step(tap, dx, dT, work.dz)
+    limit_rows.row_steps(work.dz, dT, T, work.v, work.jacobian, limits, dg)
     product = by_T * dT
     for k in range(dx.shape[0]):
         for j in range(dx.shape[1]):
             product += rhs[k, j] * dx[k, j]
-    return dT, by_T, product
+    return dT, product
 
 
 @njit(cache=True, error_model="numpy")
 def _descent(
-    y: Array,
-    T: float,
-    z: Array,
-    v: Array,
-    jacobian: Array,
-    limits: tuple,
-    rho: float,
-    factor: float,
-    first: Indices,
-    taps: Array,
-    slope: Array,
-    y_weights: Array,
-    dual: Array,
-    out: Array,
+    y: Array, T: float, work: WorkArrays, tap: ThreeTap, limits: tuple, rho: float, factor: float, out: Array
 ) -> float:
-    dual[:] = 0.0
-    limit_rows.constraint_weights(y, limits, y_weights)
-    by_T = limit_rows.rows_transposed(y, T, v, jacobian, limits, y_weights, dual)
-    by_T += newton_matrix.add_objective_gradient(z[CURVATURE], T, rho, -factor, dual)
-    return by_T + three_tap.pull_back(first, taps, slope, dual, out)
+    dual, weights = np.zeros(work.z.shape), np.empty(work.weights.shape)
+    limit_rows.constraint_weights(y, limits, weights)
+    by_T = limit_rows.rows_transposed(y, T, work.v, work.jacobian, limits, weights, dual)
+    by_T += newton_matrix.add_objective_gradient(work.z[CURVATURE], T, rho, -factor, dual)
+    return by_T + three_tap.pull_back(tap, dual, out)

@@ -18,9 +18,10 @@ from dyngrasp.planning.collocation.interior_point import InteriorPoint
 from dyngrasp.planning.collocation.iterates import InteriorPointSettings, Outcome
 from dyngrasp.planning.collocation.limit_rows import LimitRows
 from dyngrasp.planning.collocation.node_functions import InterpretedNodeFunctions, NodeFunctions, node_functions
-from dyngrasp.planning.collocation.phase_model import PhaseModel, WorkArrays
+from dyngrasp.planning.collocation.phase_model import PhaseModel
 from dyngrasp.planning.collocation.three_tap import CURVATURE
 from dyngrasp.planning.collocation.window import EARLIEST, LATEST, Window
+from dyngrasp.planning.collocation.work_arrays import WorkArrays
 from dyngrasp.planning.problem import MIN_INTERVALS, NodeConstraint, PhaseProblem, Solution, Status
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory
@@ -199,7 +200,7 @@ class StructuredSolver:
         if kept is None:
             settings = self.settings
             numbers = (settings.tolerance, settings.violation_tolerance, settings.max_iterations)
-            kept = WorkArrays(*size), InteriorPoint(InteriorPointSettings(*numbers))
+            kept = WorkArrays.of(*size[:3]), InteriorPoint(InteriorPointSettings(*numbers))
         self._methods[size] = kept
         while len(self._methods) > KEPT:
             del self._methods[next(iter(self._methods))]
@@ -244,7 +245,7 @@ def compile_kernels() -> None:
     )
     functions: list[NodeFunctions] = [InterpretedNodeFunctions(row)]
     limits = LimitRows.of(problem, functions)
-    work = WorkArrays(MIN_INTERVALS + 1, 1, limits.constraint_rows, limits.rows_per_point)
+    work = WorkArrays.of(MIN_INTERVALS + 1, 1, limits.constraint_rows)
     model = PhaseModel(problem, functions, limits, work)
     start = closed_form.unconstrained_optimum(problem)
     x = model.map.unknowns(start)

@@ -20,8 +20,8 @@ also on T:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -36,9 +36,8 @@ TAPS = 3  # unknowns that a grid point depends on
 POSITION, RATE, CURVATURE = 0, 1, 2  # order of q, w, a wherever the three are an axis of an array
 
 
-@dataclass(frozen=True)
-class ThreeTap:
-    """The affine map from x and T to q, w, a on the grid of one problem.
+class ThreeTap(NamedTuple):
+    """The affine map from x and T to q, w, a on the grid of one problem; compiled functions take it whole.
 
     Attributes:
         first: (N+1,) index of the first unknown that a grid point depends on.
@@ -55,12 +54,11 @@ class ThreeTap:
     @classmethod
     def of(cls, problem: PhaseProblem) -> ThreeTap:
         """The map of a problem's grid and boundary states."""
-        first, taps, reach = _filters(problem.intervals)
-        h = 1.0 / problem.intervals
+        first, taps, by_position, by_rate = _filters(problem.intervals)
         ends = np.stack([problem.start_position, problem.end_position])
         rates = np.stack([problem.start_velocity, problem.end_velocity])
-        # r[−1], r[1] = 2 q_S − r[0] ∓ h T q̇_S, and the same at the far end.
-        return cls(first, taps, 2 * (reach[..., 0] + reach[..., 1]) @ ends, h * (reach[..., 1] - reach[..., 0]) @ rates)
+        shape = (3, problem.intervals + 1, problem.joints)
+        return cls(first, taps, (by_position @ ends).reshape(shape), (by_rate @ rates).reshape(shape))
 
     def unknowns(self, trajectory: Trajectory) -> Array:
         """(N−1, n) x of a motion on this grid: r[k] = q[k] − h² a[k] / 4."""
@@ -71,16 +69,17 @@ class ThreeTap:
     def expand(self, x: Array, duration: float) -> Array:
         """(3, N+1, n) q, w and a of unknowns x (N−1, n) and a duration T."""
         z = np.empty_like(self.offset)
-        expand(self.first, self.taps, self.offset, self.slope, x, duration, z)
+        expand(self, x, duration, z)
         return z
 
 
 @lru_cache(maxsize=64)
-def _filters(intervals: int) -> tuple[Indices, Array, Array]:
-    """`first`, `taps` and the coefficients (3, N+1, 2, 2) of the four eliminated values [z, k, end, before/after]."""
+def _filters(intervals: int) -> tuple[Indices, Array, Array, Array]:
+    """`first`, `taps`, and how `offset` and `slope`, as (3 (N+1), n), follow from both ends' q and q̇ (2, n)."""
     N, h = intervals, 1.0 / intervals
     weights = np.array([[0.25, -0.5 / h, 1 / h**2], [0.5, 0.0, -2 / h**2], [0.25, 0.5 / h, 1 / h**2]])
     first = np.clip(np.arange(N + 1) - 2, 0, N - 4)
+    # Coefficients of the four eliminated values [z, k, end, before/after].
     taps, reach = np.zeros((N + 1, TAPS, 3)), np.zeros((3, N + 1, 2, 2))
     eliminated = {-1: (0, 0), 1: (0, 1), N - 1: (1, 0), N + 1: (1, 1)}
     column = {0: 0, N: N - 2} | {i: i - 1 for i in range(2, N - 1)}
@@ -94,14 +93,18 @@ def _filters(intervals: int) -> tuple[Indices, Array, Array]:
                 taps[k, column[N * end] - first[k]] -= weight
             else:
                 taps[k, column[i] - first[k]] += weight
-    for array in (first, taps, reach):
+    # r[−1], r[1] = 2 q_S − r[0] ∓ h T q̇_S, and the same at the far end.
+    by_position = (2 * (reach[..., 0] + reach[..., 1])).reshape(-1, 2)
+    by_rate = (h * (reach[..., 1] - reach[..., 0])).reshape(-1, 2)
+    for array in (first, taps):
         array.setflags(write=False)
-    return first, taps, reach
+    return first, taps, by_position, by_rate
 
 
 @njit(cache=True)
-def expand(first: Indices, taps: Array, offset: Array, slope: Array, x: Array, duration: float, z: Array) -> None:
+def expand(tap: ThreeTap, x: Array, duration: float, z: Array) -> None:
     """Write z = offset + T slope + taps applied to x."""
+    first, taps, offset, slope = tap
     kinds, points, n = z.shape
     for kind in range(kinds):
         for k in range(points):
@@ -113,11 +116,9 @@ def expand(first: Indices, taps: Array, offset: Array, slope: Array, x: Array, d
 
 
 @njit(cache=True)
-def place(
-    first: Indices, taps: Array, offset: Array, slope: Array, x: Array, duration: float, z: Array, v: Array
-) -> None:
+def place(tap: ThreeTap, x: Array, duration: float, z: Array, v: Array) -> None:
     """`expand`, and the accelerations v = a / T²."""
-    expand(first, taps, offset, slope, x, duration, z)
+    expand(tap, x, duration, z)
     scale = 1.0 / duration**2
     for k in range(v.shape[0]):
         for j in range(v.shape[1]):
@@ -125,8 +126,9 @@ def place(
 
 
 @njit(cache=True)
-def expand_step(first: Indices, taps: Array, slope: Array, dx: Array, dT: float, dz: Array) -> None:
+def expand_step(tap: ThreeTap, dx: Array, dT: float, dz: Array) -> None:
     """The linear part of `expand`: how q, w and a change with dx and dT."""
+    first, taps, _, slope = tap
     kinds, points, n = dz.shape
     for kind in range(kinds):
         for k in range(points):
@@ -138,19 +140,18 @@ def expand_step(first: Indices, taps: Array, slope: Array, dx: Array, dT: float,
 
 
 @njit(cache=True)
-def pull_back(first: Indices, taps: Array, slope: Array, dual: Array, gradient: Array) -> float:
+def pull_back(tap: ThreeTap, dual: Array, gradient: Array) -> float:
     """The transpose of `expand_step`: derivatives by q, w and a become derivatives by x.
 
     Args:
-        first: The map, and so are the next two.
-        taps: (N+1, 3, 3)
-        slope: (3, N+1, n)
+        tap: The map.
         dual: (3, N+1, n) derivatives of a scalar by q, w and a.
         gradient: (N−1, n), overwritten by the derivatives by x.
 
     Returns:
         The derivative by T through `slope`.
     """
+    first, taps, _, slope = tap
     kinds, points, n = dual.shape
     gradient[:] = 0.0
     by_duration = 0.0
