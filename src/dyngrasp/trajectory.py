@@ -89,12 +89,13 @@ class Trajectory:
             times: (M,) times in seconds, clamped to [0, duration].
 
         Returns:
-            Position, velocity, acceleration, each (M, n).
+            Position, velocity, acceleration, each (M, n), read-only.
         """
         times = np.asarray(times, dtype=float)
         out = np.empty((3, times.size, self.position.shape[1]))
         _interpolate(self.duration, self.position, self.velocity, self.acceleration, times, out)
-        return out[0], out[1], out[2]
+        q, w, v = frozen(out)
+        return q, w, v
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
@@ -123,10 +124,10 @@ def _largest_jump(q_0, w_0, q_1, w_1, q_2, w_2):
 @njit(cache=True, fastmath={"reassoc"})
 def _all_finite(position, velocity, acceleration):
     for array in (position, velocity, acceleration):
-        # What is no number or infinite leaves no zero when it is taken from itself.
-        rest = 0.0
-        for value in array.ravel():
-            rest += value - value
+        # Nothing times a finite number is nothing. Summed up without a branch, for that becomes vector instructions.
+        values, rest = array.ravel(), 0.0
+        for i in range(values.size):
+            rest += 0.0 * values[i]
         if rest != 0.0:
             return False
     return True

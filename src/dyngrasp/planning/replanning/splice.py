@@ -126,7 +126,8 @@ def stretched(trajectory: Trajectory, duration: float) -> Trajectory:
     ratio = trajectory.duration / duration
     if ratio == 1.0:
         return trajectory
-    return Trajectory(duration, trajectory.position, trajectory.velocity * ratio, trajectory.acceleration * ratio**2)
+    velocity, acceleration = trajectory.velocity * ratio, trajectory.acceleration * ratio**2
+    return Trajectory(duration, trajectory.position, frozen(velocity), frozen(acceleration))
 
 
 def _approach(

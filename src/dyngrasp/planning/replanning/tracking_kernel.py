@@ -64,9 +64,8 @@ def solve(
     bands: Array,
     max_iterations: int,
     z: Array,
-    codes: Indices,
-    multipliers: Array,
-) -> tuple[int, float, int, int]:
+    motion: Array,
+) -> tuple[int, float, int, Indices, Array]:
     """Minimise ½ Σ_k Σ_j Q_q δq² + Q_q̇ δq̇² + Q_v δv² + ½ Σ_k Q_ΔT δT² between two boundary states, within boxes.
 
     Args:
@@ -86,11 +85,12 @@ def solve(
         bands: Of `filters`.
         max_iterations: Of the interior point method.
         z: (3, K, n), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
-        codes: At least 12 K n integers, overwritten by the codes of the rows that were imposed.
-        multipliers: As many floats and two more, overwritten by their multipliers, the last two those of T.
+        motion: (3, K, n), overwritten by q, q̇, q̈, at both ends to the last digit those given; left as it is with
+            `paper_rows`.
 
     Returns:
-        Outcome, T, iterations of the interior point method, number of rows imposed.
+        Outcome, T, iterations of the interior point method, codes of the rows that were imposed, and their multipliers
+        with those of the two bounds of T.
     """
     K, n = reference[0].shape
     boxes[:] = np.minimum(np.maximum(boxes, -UNBOUNDED), UNBOUNDED)
@@ -180,7 +180,10 @@ def solve(
     a_ends = (not held[0], not held[1])
     least = least_row(z, T, T_lin, boxes, rates, a_ends)
     iterations, outcome, count = 0, OPTIMAL, 0
+    codes, multipliers = np.empty(0, np.int64), np.zeros(2)
     if least < -VIOLATION:
+        codes = np.empty(12 * K * n, np.int64)
+        multipliers = np.empty(codes.size + 2)
         count, _ = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
         slope, error, by_T, duals = np.empty_like(z), np.empty_like(z), np.empty_like(z), np.zeros_like(z)
         filtered(r_by_T, slope)
@@ -235,15 +238,14 @@ def solve(
                 count, _ = collect(z_free, T_free, T_lin, boxes, rates, np.inf, a_ends, codes)
         if outcome == OPTIMAL and least < -VIOLATION:
             outcome = INFEASIBLE
-    else:
-        multipliers[:2] = 0.0
     if not paper_rows:
         boundary(T, T_ref, ends, reference, False, values, slopes)
         sequence(x, values, held, r)
         filtered(r, z)
+        _in_real_time(z, T, ends, held, motion)
     if outcome == OPTIMAL and not (0.0 < T < np.inf and product(z, z) < np.inf):
         outcome = NONFINITE
-    return outcome, T, iterations, count
+    return outcome, T, iterations, codes[:count].copy(), multipliers[: count + 2].copy()
 
 
 @njit(cache=True, error_model="numpy")
@@ -290,3 +292,15 @@ def _errors(reference: Motion, T: float, T_ref: float, z: Array, slope: Array, e
         factor, factor_by_T = _of_reference(kind, T, T_ref)
         error[kind] = z[kind] - factor * reference[kind]
         by_T[kind] = slope[kind] - factor_by_T * reference[kind]
+
+
+@njit(cache=True, error_model="numpy")
+def _in_real_time(z: Array, T: float, ends: Array, held: tuple[bool, bool], motion: Array) -> None:
+    """Write q, q̇, q̈ (3, N+1, n) of q, w, a, and into their ends what was given there."""
+    for kind in range(3):
+        factor, scaled, out = T**-kind, z[kind].ravel(), motion[kind].ravel()
+        for i in range(out.size):
+            out[i] = factor * scaled[i]
+        for end in range(2):
+            if kind < 2 or held[end]:
+                motion[kind, -end] = ends[end, kind]

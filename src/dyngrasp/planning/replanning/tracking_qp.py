@@ -102,6 +102,7 @@ class TrackingSolution:
     Attributes:
         status: `converged`, or why not.
         duration: ΔT (s).
+        motion: (3, N+1, n) q (rad), q̇ (rad/s), q̈ (rad/s²); without meaning with `paper_rows`.
         scaled: (3, N+1, n) q (rad), w = T q̇ and a = T² q̈ (rad); with `paper_rows` their linear model.
         iterations: Of the interior point method; 0 where no box is active.
         rows: Codes of the rows that were imposed, see `box_rows`.
@@ -111,6 +112,7 @@ class TrackingSolution:
 
     status: Status
     duration: float
+    motion: Array
     scaled: Array
     iterations: int
     rows: Indices
@@ -121,18 +123,7 @@ class TrackingSolution:
         """The motion in real time, its boundary states those of the problem to the last digit."""
         if problem.paper_rows:
             return paper_update(problem.reference, paper_step(problem, self))
-        T = self.duration
-        motion = np.empty_like(self.scaled)
-        motion[0] = self.scaled[0]
-        np.multiply(self.scaled[1], 1 / T, out=motion[1])
-        np.multiply(self.scaled[2], 1 / T**2, out=motion[2])
-        for k, state, held in (
-            (0, problem.start, problem.hold_start_acceleration),
-            (-1, problem.end, problem.hold_end_acceleration),
-        ):
-            given = 3 if held else 2
-            motion[:given, k] = state[:given]
-        return Trajectory(T, *frozen(motion))
+        return Trajectory(self.duration, *self.motion)
 
 
 _STATUS = {
@@ -164,10 +155,8 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
     boxes[0], boxes[1] = problem.position_lower, problem.position_upper
     boxes[2], boxes[3] = problem.velocity_limit, problem.acceleration_limit
     first, taps, bands = filters(N, *held, not problem.paper_rows)
-    scaled = np.empty((3, N + 1, n))
-    codes = np.empty(12 * (N + 1) * n, dtype=np.int64)
-    multipliers = np.empty(codes.size + 2)
-    outcome, duration, iterations, count = tracking_kernel.solve(
+    scaled, motion = np.empty((3, N + 1, n)), np.empty((3, N + 1, n))
+    outcome, duration, iterations, rows, multipliers = tracking_kernel.solve(
         (reference.position, reference.velocity, reference.acceleration),
         reference.duration,
         ends,
@@ -184,12 +173,11 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
         bands,
         max_iterations,
         scaled,
-        codes,
-        multipliers,
+        motion,
     )
     elapsed = 1e3 * (time.perf_counter() - began)
     return TrackingSolution(
-        _STATUS[outcome], duration, scaled, iterations, codes[:count].copy(), multipliers[: count + 2].copy(), elapsed
+        _STATUS[outcome], duration, frozen(motion), frozen(scaled), iterations, rows, multipliers, elapsed
     )
 
 
