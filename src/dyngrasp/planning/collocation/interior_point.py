@@ -15,8 +15,9 @@ The Newton matrix is made positive definite: the banded part by leaving out part
 Cholesky factorisation succeeds, then by adding multiples of the second derivative of Σ|a|²; the row of T by replacing a
 Schur complement that is not positive.
 
-E = dᵀ K d + Σ s λ + Σ t (ν − λ), with d the step for μ = 0 and K the Newton matrix: near a solution twice what a full
-step lowers the objective by, plus the duality gap. It has the unit of the objective whatever the grid.
+E = dᵀ K d + Σ s λ + Σ t (ν − λ), with K the Newton matrix and d the step for μ = 0, in monotone mode for the fixed μ,
+which spares a direction: near a solution twice what a full step lowers the objective by, plus the duality gap. It has
+the unit of the objective whatever the grid.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ class InteriorPoint:
             self._raise_price()
             if not self._factorise():
                 return Outcome.NONFINITE, self.best, iteration
-            decrement = self._direction(0.0, corrected=False)
+            decrement = self._direction(0.0 if self.free else self.mu, corrected=False)
             mean, elastic = self._complementarity(0.0, 0.0)
             error = decrement + mean * self.s.size + elastic
             if not np.isfinite(error):
@@ -146,11 +147,14 @@ class InteriorPoint:
                 self.slow_limit += LONGER
                 self._restart(model.factor, iteration)
                 continue
+            was_free = self.free
             if not self._choose_mode(error, mean):
                 self._undo_step()
             elif self.free:
+                if not was_free:
+                    self._direction(0.0, corrected=False)
                 self._mehrotra_step(mean)
-            elif not self._armijo_step():
+            elif not self._armijo_step(decrement):
                 if feasible:
                     solved = error <= ACCEPTABLE * settings.tolerance * self.unit
                     return Outcome.OPTIMAL if solved else Outcome.STALLED, self.best, iteration
@@ -277,11 +281,10 @@ class InteriorPoint:
         rows.moved_slacks(self.g_new, self.s, self.t, *steps, self.s_new, self.t_new)
         self._accept(objective, dual, mu, 0.0)
 
-    def _armijo_step(self) -> bool:
-        """A step of the barrier problem for the present μ; False if rounding allows no descent."""
+    def _armijo_step(self, decrement: float) -> bool:
+        """A step along the direction for the present μ; False if rounding allows no descent."""
         factor, mu = self.model.factor, self.mu
         products = self.s.size * mu
-        decrement = self._direction(mu, corrected=False)
         mean, _ = self._complementarity(0.0, 0.0)
         slope = self.model.objective_slope(self.dT)
         slope += rows.barrier_slope(self.s, self.t, self.ds, self.dt, self.price, mu)
