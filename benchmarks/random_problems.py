@@ -5,7 +5,8 @@
 Poses of the part, start postures and velocities, targets, effort weights, torque limits and grids are drawn at random;
 some of these problems have no solution. What the solver calls solved is measured apart from it; what it does not solve
 is given to IPOPT from the same start and from the solver's own last motion. A thirtieth of what is solved goes to IPOPT
-too, for the objective.
+too, for the objective. And what is solved is solved again with its start or its end a little elsewhere, from the motion
+before: a start that is known must not make a problem harder than it is.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ PLACE = np.deg2rad([-45.0, 34.0, 0.0, -53.0, 0.0, 93.0, 90.0])
 GRIDS = (20, 50, 100)
 COMPARED = 30  # one in so many of the solved ones is solved by IPOPT too
 SAME = 1e-5
+ELSEWHERE = 0.02  # rad, at most, of each joint: as after a move of the part by a centimetre
 
 
 def problems(seed: int) -> Iterator[tuple[PhaseProblem, Trajectory | None]]:
@@ -85,6 +87,19 @@ def _stands_at_its_ends(problem: PhaseProblem) -> bool:
     return True
 
 
+def elsewhere(problem: PhaseProblem, random: np.random.Generator) -> PhaseProblem | None:
+    """The phase with that end a little elsewhere where no part is; None if a limit forbids it or there is none."""
+    move = random.uniform(-ELSEWHERE, ELSEWHERE, problem.joints)
+    try:
+        if problem.name == "approach":
+            return replace(problem, start_position=problem.start_position + move)
+        if problem.name == "deliver":
+            return replace(problem, end_position=problem.end_position + move)
+    except InvalidProblem:
+        pass
+    return None
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--problems", type=int, default=300)
@@ -96,12 +111,16 @@ def main() -> None:
     solver, reference = StructuredSolver(), IpoptSolver(IpoptSettings(max_iterations=300, time_limit=60.0))
     counts: Counter[str] = Counter()
     times, worst, disagreements, change = [], 0.0, [], []
+    moves, again = np.random.default_rng(arguments.seed), []
     for index, (problem, guess) in zip(range(arguments.problems), problems(arguments.seed), strict=False):
         solution = solver.solve(problem, guess)
         times.append(solution.timings_ms["total"])
         counts[f"{problem.name}: {solution.status}"] += 1
         if solution.ok:
             worst = max(worst, worst_violation(problem, solution.require())[0])
+            if (other := elsewhere(problem, moves)) is not None:
+                warm, cold = solver.solve(other, solution.require()), solver.solve(other, guess)
+                again.append((warm.ok, cold.ok, warm.iterations, cold.iterations))
             if index % COMPARED == 0 and (other := reference.solve(problem, guess)).ok:
                 change.append(solution.objective / other.objective - 1)
             continue
@@ -119,6 +138,12 @@ def main() -> None:
             "same": sum(abs(c) <= SAME for c in change),
             "better": sum(c < -SAME for c in change),
             "worse": sum(c > SAME for c in change),
+        },
+        "solved_again": {
+            "problems": len(again),
+            "from_the_motion_before": sum(warm for warm, *_ in again),
+            "from_the_usual_start": sum(cold for _, cold, *_ in again),
+            "iterations_from_either": np.median([case[2:] for case in again], axis=0).tolist(),
         },
         "disagreements": disagreements,
     }
