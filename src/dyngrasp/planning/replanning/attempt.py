@@ -14,7 +14,7 @@ from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targe
 from dyngrasp.planning.problem import AuditReport, PhaseProblem, Status
 from dyngrasp.planning.replanning.full_problem import FullProblem, raised
 from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery, funnel_recovery
-from dyngrasp.planning.replanning.outcome import Path, ReplannerSettings, ReplanResult
+from dyngrasp.planning.replanning.outcome import Path, ReplannerSettings, ReplanResult, about_the_approach, failures_of
 from dyngrasp.planning.replanning.phase_programs import APPROACH, DELIVER, GRASP
 from dyngrasp.planning.replanning.splice import Candidate, splice_time, track
 from dyngrasp.planning.replanning.target_update import target_updater
@@ -134,10 +134,10 @@ class Attempt:
             if self.report.ok or not self.settings.gate:
                 return self._published(best, targets, Path.TRACKING, self.settings.budget)
             status = Status.AUDIT_FAILED
-            self.reasons.append(f"tracking: {_failures(self.report)}")
+            self.reasons.append(f"tracking: {failures_of(self.report)}")
             if self._late(self.settings.budget):
                 return self._kept(Status.DEADLINE_MISSED, targets, "no time for another attempt")
-            if not _about_the_approach(self.report, best):
+            if not about_the_approach(self.report, best):
                 break
         if best is not None and self.full is not None and phase == APPROACH:
             found, path = self._reoptimised(best, targets)
@@ -211,7 +211,7 @@ class Attempt:
             self.report = self._audited(anew, targets)
             if self.report.ok:
                 return anew, Path.DESCENT
-            self.reasons.append(f"descent: {_failures(self.report)}")
+            self.reasons.append(f"descent: {failures_of(self.report)}")
             candidate = anew
         return self._refined(candidate, set(), problems, state, targets, self.settings.budget), Path.REOPTIMISED
 
@@ -250,7 +250,7 @@ class Attempt:
             self.report = self._audited(plan, targets)
             if self.report.ok:
                 return plan
-        self.reasons.append(f"full problem: {why or _failures(self.report)}")
+        self.reasons.append(f"full problem: {why or failures_of(self.report)}")
         return None
 
     def _fresh_or_kept(
@@ -290,7 +290,7 @@ class Attempt:
         self.report = self._audited(fresh, targets)
         if not self.report.ok:
             assert problems is not None
-            self.reasons.append(f"fresh plan: {_failures(self.report)}")
+            self.reasons.append(f"fresh plan: {failures_of(self.report)}")
             fresh = self._refined(fresh, {APPROACH, GRASP, DELIVER}, problems, state, targets, budget)
         if fresh is None:
             return self._kept(Status.AUDIT_FAILED, targets, "")
@@ -347,12 +347,3 @@ class Attempt:
             "; ".join(self.reasons),
             self.iterations,
         )
-
-
-def _about_the_approach(report: AuditReport, plan: GraspPlan) -> bool:
-    """Whether all that fails happens before the pre-grasp, where another descent may help."""
-    return all(entry.time <= plan.phase_ends[APPROACH] for entry in report.failures)
-
-
-def _failures(report: AuditReport) -> str:
-    return "audit: " + "; ".join(str(entry) for entry in report.failures)

@@ -63,45 +63,30 @@ def collect(
     _, K, n = z.shape
     count, least = 0, np.inf
     shift = T - T_lin
+    scales, highest, lowest = np.empty(n), np.empty(n), np.empty(n)
     for kind in range(3):
-        for k in range(K):
-            end = k == 0 or k == K - 1
-            if end and (kind < 2 or (k == 0 and not a_ends[0]) or (k > 0 and not a_ends[1])):
-                continue
-            for j in range(n):
-                if kind > 0 and boxes[kind + 1, j] >= UNBOUNDED:
-                    continue
-                value = z[kind, k, j]
-                for side in range(2):
-                    sign = 1.0 - 2.0 * side
-                    b, c, scale = bound(kind, k, j, sign, T_lin, boxes, rates)
-                    g = (b + c * shift - sign * value) * scale
-                    least = min(least, g)
-                    if g < margin:
-                        codes[count] = ((kind * 2 + side) * K + k) * n + j
-                        count += 1
-    return count, least
-
-
-@njit(cache=True, error_model="numpy")
-def least_row(z: Array, T: float, T_lin: float, boxes: Array, rates: Array, a_ends: tuple[bool, bool]) -> float:
-    """The least row of all, as `collect` finds it; from the extremes of each joint, where its rows have one bound."""
-    _, K, n = z.shape
-    if rates.shape[1] > 0:
-        return collect(z, T, T_lin, boxes, rates, -np.inf, a_ends, np.empty(0, np.int64))[1]
-    least = np.inf
-    highest, lowest = np.empty(n), np.empty(n)
-    for kind in range(3):
+        # Only the paper's rows differ from grid point to grid point, and they by what is taken off the value below.
+        paper = kind > 0 and rates.shape[1] > 0
+        for j in range(n):
+            b, c, scales[j] = bound(kind, 0, j, 1.0, T_lin, boxes, rates)
+            highest[j] = b if paper else b + c * shift
+            b, c, _ = bound(kind, 0, j, -1.0, T_lin, boxes, rates)
+            lowest[j] = -b if paper else -b - c * shift
+            if kind > 0 and boxes[kind + 1, j] >= UNBOUNDED:
+                highest[j], lowest[j] = np.inf, -np.inf
         first = 0 if kind == 2 and a_ends[0] else 1
         last = K if kind == 2 and a_ends[1] else K - 1
-        highest[:], lowest[:] = z[kind, first], z[kind, first]
-        for k in range(first + 1, last):
+        for k in range(first, last):
             for j in range(n):
                 value = z[kind, k, j]
-                highest[j], lowest[j] = max(highest[j], value), min(lowest[j], value)
-        for j in range(n):
-            if kind == 0 or boxes[kind + 1, j] < UNBOUNDED:
-                for sign, extreme in ((1.0, highest[j]), (-1.0, lowest[j])):
-                    b, c, scale = bound(kind, first, j, sign, T_lin, boxes, rates)
-                    least = min(least, (b + c * (T - T_lin) - sign * extreme) * scale)
-    return least
+                if paper:
+                    value -= rates[kind - 1, k, j] * shift
+                above, below = (highest[j] - value) * scales[j], (value - lowest[j]) * scales[j]
+                nearer = min(above, below)
+                least = min(least, nearer)
+                if nearer < margin:
+                    for side, g in ((0, above), (1, below)):
+                        if g < margin:
+                            codes[count] = ((kind * 2 + side) * K + k) * n + j
+                            count += 1
+    return count, least

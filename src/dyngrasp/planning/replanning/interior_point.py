@@ -93,12 +93,12 @@ def interior_point(
     size = K - 2
     all_rows = 6 * K * n
     m = all_rows + 2
-    kinds, nodes, joints = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m, np.int64)
-    signs, cs, scales, g = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    # A row is g = … + cs T + Σ_b along[b] x[f + b, j]: three unknowns of a joint, n apart in memory from `at` on.
+    at, along, cs, g = np.empty(m, np.int64), np.empty((m, TAPS)), np.empty(m), np.empty(m)
     imposed, found = np.zeros(all_rows, np.bool_), np.empty(all_rows, np.int64)
     for i in range(rows):
         imposed[codes[i]] = True
-    _impose(codes, 0, rows, n, K, T, T_lin, z, slope, boxes, rates, kinds, nodes, joints, signs, scales, cs, g)
+    _impose(codes, 0, rows, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
     shortest, longest = duration
     limited_T = free_T and longest < np.inf
     cs[rows], cs[rows + 1] = 1.0 / longest, -1.0 / longest
@@ -119,6 +119,7 @@ def interior_point(
         lam[i] = mu / s[i]
     band, column, solved = np.empty((size, 3, n)), np.empty((size, n)), np.empty((size, n))
     gradient, step, dual = np.empty((size, n)), np.empty((size, n)), np.empty_like(z)
+    flat_band, flat_column, flat_step = band.ravel(), column.ravel(), step.ravel()
     # Steps that z has not followed yet: it is asked for only when rows are looked for.
     ahead, ahead_T = np.zeros((size, n)), 0.0
     k_first, k_last = (0, K) if ends_cost else (1, K - 1)
@@ -155,9 +156,7 @@ def interior_point(
                 # The rows of T stay the last.
                 for array in (s, lam, g, cs, ds, dlam, dg):
                     array[new], array[new + 1] = array[rows], array[rows + 1]
-                _impose(
-                    codes, rows, new, n, K, T, T_lin, z, slope, boxes, rates, kinds, nodes, joints, signs, scales, cs, g
-                )
+                _impose(codes, rows, new, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
                 for i in range(rows, new):
                     s[i] = max(g[i], LOOK_NEAR)
                     lam[i] = mean / s[i]
@@ -185,15 +184,13 @@ def interior_point(
             omega[i] = lam[i] * per_s[i]
             c_T += omega[i] * cs[i] * cs[i]
             if i < rows:
-                kind, k, j = kinds[i], nodes[i], joints[i]
-                f = first[k]
-                weight = omega[i] * scales[i] * scales[i]
-                cross = -omega[i] * cs[i] * scales[i] * signs[i]
+                # The same place in an array of three numbers an unknown: (f, 0, j) instead of (f, j).
+                in_band = 3 * at[i] - 2 * (at[i] % n)
                 for b in range(TAPS):
-                    t_b = taps[k, b, kind]
-                    column[f + b, j] += cross * t_b
+                    weight = omega[i] * along[i, b]
+                    flat_column[at[i] + b * n] += cs[i] * weight
                     for d in range(TAPS - b):
-                        band[f + b, d, j] += weight * t_b * taps[k, b + d, kind]
+                        flat_band[in_band + (3 * b + d) * n] += weight * along[i, b + d]
         factorise(band)
         if free_T:
             solved[:] = column
@@ -211,7 +208,7 @@ def interior_point(
                 second = ds[i] * dlam[i] if corrected == 1 else 0.0
                 target[i] = (sigma_mu - second) * per_s[i] - omega[i] * (g[i] - s[i])
             step[:] = -gradient
-            r_T = -g_T + _scatter(target, rows, used, kinds, nodes, joints, signs, scales, cs, first, taps, step)
+            r_T = -g_T + _scatter(target, rows, used, n, at, along, cs, flat_step)
             dT = 0.0
             if free_T:
                 dT = r_T
@@ -225,15 +222,10 @@ def interior_point(
                     for j in range(n):
                         step[i, j] -= dT * solved[i, j]
             for i in range(used):
-                change = cs[i] * dT
+                dg[i] = cs[i] * dT
                 if i < rows:
-                    kind, k, j = kinds[i], nodes[i], joints[i]
-                    f = first[k]
-                    along = 0.0
                     for b in range(TAPS):
-                        along += taps[k, b, kind] * step[f + b, j]
-                    change -= scales[i] * signs[i] * along
-                dg[i] = change
+                        dg[i] += along[i, b] * flat_step[at[i] + b * n]
             keep = 1.0 if corrected == 0 else 0.995
             shrink_primal, shrink_dual = keep, keep
             for i in range(used):
@@ -261,16 +253,18 @@ def interior_point(
         g_T += length * corner * dT
         for i in range(size):
             for j in range(n):
-                along = length * step[i, j]
-                ahead[i, j] += along
-                g_T += base_column[i, j] * along
-                gradient[i, j] += base[i, 0] * along + length * dT * base_column[i, j]
-                if i + 1 < size:
+                move = length * step[i, j]
+                ahead[i, j] += move
+                g_T += base_column[i, j] * move
+                gradient[i, j] += base[i, 0] * move + length * dT * base_column[i, j]
+            if i + 1 < size:
+                for j in range(n):
                     gradient[i, j] += base[i, 1] * length * step[i + 1, j]
-                    gradient[i + 1, j] += base[i, 1] * along
-                if i + 2 < size:
+                    gradient[i + 1, j] += base[i, 1] * length * step[i, j]
+            if i + 2 < size:
+                for j in range(n):
                     gradient[i, j] += base[i, 2] * length * step[i + 2, j]
-                    gradient[i + 2, j] += base[i, 2] * along
+                    gradient[i + 2, j] += base[i, 2] * length * step[i, j]
     _follow(taps, slope, ahead, ahead_T, dx, z)
     multipliers[:] = 0.0
     multipliers[:used] = lam[:used]
@@ -281,10 +275,7 @@ def interior_point(
 def _follow(taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, z: Array) -> None:
     """Add steps (N−1, n) of the unknowns, and one of T, to dx and z; the former are zero afterwards."""
     push_forward(taps, ahead, z)
-    for kind in range(3):
-        for k in range(z.shape[1]):
-            for j in range(z.shape[2]):
-                z[kind, k, j] += slope[kind, k, j] * ahead_T
+    z += ahead_T * slope
     dx += ahead
     ahead[:] = 0.0
 
@@ -302,50 +293,34 @@ def _impose(
     slope: Array,
     boxes: Array,
     rates: Array,
-    kinds: Indices,
-    nodes: Indices,
-    joints: Indices,
-    signs: Array,
-    scales: Array,
+    first: Indices,
+    taps: Array,
+    at: Indices,
+    along: Array,
     cs: Array,
     g: Array,
 ) -> None:
-    """Decode some rows, and write their values g and their derivatives cs by T."""
+    """Decode some rows, and write their values g, their derivatives cs by T, and those by the unknowns."""
     for i in range(begin, end):
         j = codes[i] % n
         k = (codes[i] // n) % K
         kind = codes[i] // (n * K * 2)
         sign = 1.0 - 2.0 * ((codes[i] // (n * K)) % 2)
         b, c, scale = bound(kind, k, j, sign, T_lin, boxes, rates)
-        kinds[i], nodes[i], joints[i], signs[i], scales[i] = kind, k, j, sign, scale
+        at[i] = first[k] * n + j
+        for tap in range(TAPS):
+            along[i, tap] = -scale * sign * taps[k, tap, kind]
         cs[i] = (c - sign * slope[kind, k, j]) * scale
         g[i] = (b + c * (T - T_lin) - sign * z[kind, k, j]) * scale
 
 
 @njit(cache=True, error_model="numpy")
-def _scatter(
-    y: Array,
-    rows: int,
-    used: int,
-    kinds: Indices,
-    nodes: Indices,
-    joints: Indices,
-    signs: Array,
-    scales: Array,
-    cs: Array,
-    first: Indices,
-    taps: Array,
-    out: Array,
-) -> float:
-    """Add Gᵀ y to out (N−1, n); return the part of T."""
+def _scatter(y: Array, rows: int, used: int, n: int, at: Indices, along: Array, cs: Array, out: Array) -> float:
+    """Add Gᵀ y to out ((N−1) n,); return the part of T."""
     by_T = 0.0
     for i in range(used):
-        value = y[i]
-        by_T += value * cs[i]
+        by_T += y[i] * cs[i]
         if i < rows:
-            kind, k, j = kinds[i], nodes[i], joints[i]
-            f = first[k]
-            value *= -scales[i] * signs[i]
             for b in range(TAPS):
-                out[f + b, j] += value * taps[k, b, kind]
+                out[at[i] + b * n] += y[i] * along[i, b]
     return by_T

@@ -96,3 +96,13 @@ class ReplanResult:
         if not self.ok:
             raise PlanningFailed(f"{self.status}: {self.message}", self)
         return self.plan
+
+
+def about_the_approach(report: AuditReport, plan: GraspPlan) -> bool:
+    """Whether all that fails happens before the pre-grasp, where another descent may help."""
+    return all(entry.time <= plan.phase_ends[0] for entry in report.failures)
+
+
+def failures_of(report: AuditReport) -> str:
+    """What an audit found wrong, in words."""
+    return "audit: " + "; ".join(str(entry) for entry in report.failures)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect, least_row
+from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
 from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     POSITION,
@@ -178,9 +178,9 @@ def solve(
         rates[1] = 2 * T_ref * reference[2]
         T_lin = T_ref
     a_ends = (not held[0], not held[1])
-    least = least_row(z, T, T_lin, boxes, rates, a_ends)
     iterations, outcome, count = 0, OPTIMAL, 0
     codes, multipliers = np.empty(0, np.int64), np.zeros(2)
+    _, least = collect(z, T, T_lin, boxes, rates, -np.inf, a_ends, codes)
     if least < -VIOLATION:
         codes = np.empty(12 * K * n, np.int64)
         multipliers = np.empty(codes.size + 2)
