@@ -72,7 +72,7 @@ class Trajectory:
     def sample_as(self, local: float, t: float, at_rest: bool = False) -> JointState:
         """State at `local` (s) under the time `t` (s) of another clock; with velocity and acceleration 0 if at rest."""
         state = np.empty((3, 1, self.position.shape[1]))
-        _interpolate(self.duration, self.position, self.velocity, self.acceleration, np.array([local]), state)
+        interpolate(self.duration, self.position, self.velocity, self.acceleration, np.array([local]), state)
         if at_rest:
             state[1:] = 0.0
         return JointState(t, *frozen(state)[:, 0])
@@ -93,13 +93,13 @@ class Trajectory:
         """
         times = np.asarray(times, dtype=float)
         out = np.empty((3, times.size, self.position.shape[1]))
-        _interpolate(self.duration, self.position, self.velocity, self.acceleration, times, out)
+        interpolate(self.duration, self.position, self.velocity, self.acceleration, times, out)
         q, w, v = frozen(out)
         return q, w, v
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
-        return _largest_defect(self.duration, self.position, self.velocity, self.acceleration)
+        return largest_defect(self.duration, self.position, self.velocity, self.acceleration)
 
 
 @njit(cache=True)
@@ -134,7 +134,7 @@ def _all_finite(position, velocity, acceleration):
 
 
 @njit(cache=True, error_model="numpy")
-def _interpolate(duration, position, velocity, acceleration, times, out):
+def interpolate(duration, position, velocity, acceleration, times, out):
     """`Trajectory.sample_many` (3, M, n); compiled, for controllers and audits ask for little and often."""
     N, n = position.shape[0] - 1, position.shape[1]
     step = duration / N
@@ -152,7 +152,8 @@ def _interpolate(duration, position, velocity, acceleration, times, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _largest_defect(duration, position, velocity, acceleration):
+def largest_defect(duration, position, velocity, acceleration):
+    """`Trajectory.dynamics_defect`; a NaN is the largest."""
     half_step, worst = duration / (position.shape[0] - 1) / 2, 0.0
     for k in range(position.shape[0] - 1):
         for i in range(position.shape[1]):

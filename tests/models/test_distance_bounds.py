@@ -6,17 +6,16 @@ import pinocchio as pin
 import pytest
 import trimesh
 
+from dyngrasp.models.bounding_volumes import Pieces, bounding_bodies, bounding_capsule, boxes_around
 from dyngrasp.models.distance_bounds import (
-    Capsules,
-    bounding_capsule,
-    box_heights,
-    heights,
-    near_boxes,
-    near_capsules,
-    seen_from,
+    lowest,
+    near_each_other,
+    near_ground,
+    near_pieces,
+    pieces_near_ground,
     tighten,
-    tracks,
 )
+from dyngrasp.models.link_motion import follow, seen_from
 
 GJK = 1e-6  # m, tolerance of Coal's iterations
 
@@ -75,113 +74,153 @@ def test_bounding_capsule_contains_the_body(name):
         assert lowest - bound < 1.5 * radius
 
 
+def on_links(shapes, links, motions):
+    """Bodies at random places on moving links, their motion, and where they are at every sample."""
+    random = np.random.default_rng(len(shapes))
+    placements = [pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.05) for _ in shapes]
+    bodies = bounding_bodies(shapes, placements, np.array(links), len(motions))
+    R, p = (np.stack(column) for column in zip(*(arrays(motion) for motion in motions), strict=True))
+    placed = [[T * place for T in motions[link]] for link, place in zip(links, placements, strict=True)]
+    return bodies, R, p, placed
+
+
+def still(samples):
+    return [pin.SE3.Identity()] * samples
+
+
+def check(found, exact, horizon, counted):
+    """Bounds are below the exact distances {pair: (S,)}, and what is left out is farther, at the samples that count."""
+    bounds = {pair: np.full(len(counted), np.inf) for pair in exact}
+    for n, pair in enumerate(map(tuple, found.pairs.tolist())):
+        own = slice(found.stops[n], found.stops[n + 1])
+        bounds[pair][found.samples[own]] = found.bounds[own]
+        assert lowest(found.stops, found.bounds)[n] == own.start + found.bounds[own].argmin()
+    for pair, distances in exact.items():
+        known = bounds[pair] < np.inf
+        assert not known[~counted].any()
+        assert (bounds[pair][known] <= distances[known] + GJK).all()
+        near = distances < horizon - GJK
+        skipped = counted & ~known & near
+        # What is left out between two samples was seen to stay where it is.
+        assert not skipped.any(), pair
+    return bounds
+
+
 @pytest.mark.parametrize("name", SHAPES)
 @pytest.mark.parametrize("seed", range(6))
-def test_bounds_to_boxes_and_their_neighbours(name, seed):
+def test_bounds_to_pieces_and_their_neighbours(name, seed):
     """Against the exact distance to the box itself at every sample, also of those that were skipped."""
     random = np.random.default_rng(seed)
     samples, horizon = 60, 0.15
-    body, part = walk(random, samples, 0.12), walk(random, samples, 0.02)
+    motions = [still(samples), walk(random, samples, 0.12), walk(random, samples, 0.02)]
+    bodies, R, p, placed = on_links([SHAPES[name], SHAPES["sphere"]], [1, 1], motions)
     half = random.uniform(0.02, 0.08, (2, 3))
     centres = random.normal(size=(2, 3)) * 0.03
-    ends, radius = bounding_capsule(SHAPES[name])
-    capsules = Capsules(np.zeros(1, np.int64), ends[None], np.array([radius]))
-    R, p = arrays(body)
-    seen = tracks(*seen_from(*arrays(part), R[None], p[None]), capsules)
+    pieces = boxes_around([centres[i] + np.vstack([-half[i], half[i]]) for i in range(2)], 7)
+    seen = follow(*seen_from(R[-1], p[-1], R, p), np.vstack([bodies.link_ends.mean(axis=1)]))
     start, stop = 3, samples - 4
-    first, box, rows = near_boxes(
-        seen.ends, seen.travel, capsules.radii, np.zeros(1, np.int64), np.array([start]), np.array([stop]),
-        centres - half, centres + half, horizon,
-    )  # fmt: skip
-    assert (first == 0).all()
-    exact = np.array(
-        [
+    found = near_pieces(seen, bodies, pieces, np.array([start, samples]), np.array([stop, samples]), horizon)
+    exact = {
+        (0, 7 + i): np.array(
             [
-                distance(SHAPES[name], body[k], coal.Box(*(2 * half[i])), part[k] * pin.SE3(np.eye(3), centres[i]))
+                distance(
+                    SHAPES[name], placed[0][k],
+                    coal.Box(*(2 * half[i])), motions[-1][k] * pin.SE3(np.eye(3), centres[i]),
+                )
                 for k in range(samples)
             ]
-            for i in range(2)
-        ]
-    )
-    for i in range(2):
-        row = rows[list(box).index(i)] if i in box else np.full(samples, np.inf)
-        counted = np.arange(start, stop)
-        known = np.isfinite(row) | np.isneginf(row)
-        assert not known[:start].any()
-        assert not known[stop:].any()
-        assert (row[counted][known[counted]] <= exact[i, counted][known[counted]] + GJK).all()
-        skipped = counted[~known[counted]]
-        assert (exact[i, skipped] >= horizon - GJK).all()
-        # One measurement bounds all neighbours.
+        )
+        for i in range(2)
+    }  # fmt: skip
+    counted = (np.arange(samples) >= start) & (np.arange(samples) < stop)
+    check(found, exact, horizon, counted)
+    # One measurement bounds all neighbours.
+    for pair, distances in exact.items():
         for k in (start, (start + stop) // 2):
-            bounds = np.full(samples, -np.inf)
-            least, where = tighten(bounds, seen.travel[0], k, exact[i, k])
-            others = np.delete(np.arange(samples), k)
+            bounds, at = np.full(samples, -np.inf), np.arange(samples)
+            least = tighten(
+                at, bounds, seen.shift[1], seen.turn[1], bodies.reaches[0],
+                seen.shift[2], seen.turn[2], pieces.reaches[pair[1] - 7], k, distances[k],
+            )  # fmt: skip
+            others = np.delete(at, k)
             assert np.isposinf(bounds[k])
-            assert (bounds[others] <= exact[i, others] + 2 * GJK).all()
-            assert (least, where) == (bounds.min(), bounds.argmin())
+            assert (bounds[others] <= distances[others] + 2 * GJK).all()
+            assert least == bounds.argmin()
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_bounds_between_capsules_are_exact_where_they_are_apart(seed):
     random = np.random.default_rng(seed)
     samples, horizon = 50, 0.2
-    motions = [walk(random, samples, 0.15) for _ in range(3)]
-    shapes = [SHAPES["capsule"], SHAPES["sphere"], SHAPES["cylinder"]]
-    bounding = [bounding_capsule(shape) for shape in shapes]
-    capsules = Capsules(
-        np.arange(3), np.array([ends for ends, _ in bounding]), np.array([radius for _, radius in bounding])
-    )
-    R, p = (np.stack(column) for column in zip(*(arrays(motion) for motion in motions), strict=True))
-    world = tracks(R, p, capsules)
-    first, second = np.array([0, 0, 1]), np.array([1, 2, 2])
-    kept, rows = near_capsules(world.ends, world.travel, capsules.radii, first, second, horizon)
-    for n, (i, j) in enumerate(zip(first, second, strict=True)):
-        row = rows[list(kept).index(n)] if n in kept else np.full(samples, np.inf)
-        for k in range(samples):
-            exact = distance(shapes[i], motions[i][k], shapes[j], motions[j][k])
-            if np.isinf(row[k]):
-                assert exact >= horizon - GJK
-            else:
-                assert row[k] <= exact + GJK
-                if j == 1 and exact > 0:
-                    assert row[k] == pytest.approx(exact, abs=GJK)
+    motions = [still(samples), *(walk(random, samples, 0.15) for _ in range(3))]
+    shapes, links = [SHAPES[name] for name in ("capsule", "sphere", "cylinder", "convex")], [1, 2, 3, 3]
+    bodies, R, p, placed = on_links(shapes, links, motions)
+    world = follow(R, p, bodies.link_ends.mean(axis=1))
+    found = near_each_other(world, bodies, np.array([[1, 2], [1, 3], [2, 3]]), horizon)
+    exact = {
+        (i, j): np.array([distance(shapes[i], placed[i][k], shapes[j], placed[j][k]) for k in range(samples)])
+        for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
+    }
+    bounds = check(found, exact, horizon, np.ones(samples, dtype=bool))
+    known = (bounds[0, 1] < np.inf) & (exact[0, 1] > 0)
+    np.testing.assert_allclose(bounds[0, 1][known], exact[0, 1][known], atol=GJK)
 
 
 def test_parallel_and_crossing_segments():
     """The cases in which the nearest points of two lines are not unique, or not on the segments."""
-    segments = np.array(
-        [
-            [[0, 0, 0], [1, 0, 0]],
-            [[0.5, 0.3, 0], [2, 0.3, 0]],  # parallel, overlapping
-            [[3, 0.4, 0], [4, 0.4, 0]],  # parallel, behind
-            [[0.5, -1, 0.2], [0.5, 1, 0.2]],  # crossing above
-            [[2, 2, 0], [2, 2, 0]],  # a point
-        ],
-        dtype=float,
-    )
-    capsules = Capsules(np.zeros(5, np.int64), segments, np.zeros(5))
-    world = tracks(np.eye(3)[None, :, :, None], np.zeros((1, 3, 1)), capsules)
-    others = np.arange(1, 5)
-    kept, rows = near_capsules(world.ends, world.travel, np.zeros(5), np.zeros(4, np.int64), others, 10.0)
-    np.testing.assert_array_equal(kept, range(4))
-    np.testing.assert_allclose(rows[:, 0], [0.3, np.hypot(2, 0.4), 0.2, np.hypot(1, 2)], atol=1e-15)
-    backwards = near_capsules(world.ends, world.travel, np.zeros(5), others, np.zeros(4, np.int64), 10.0)[1]
-    np.testing.assert_allclose(backwards, rows, atol=1e-15)
+    across, behind, above = np.array([0.5, 0, 0]), np.array([3, 0, 0]), np.array([0, 0, 1.0])
+    along, turned = pin.utils.rotate("y", np.pi / 2), pin.utils.rotate("x", np.pi / 2)
+    thin, ball = 1e-9, coal.Sphere(1e-9)
+    rod = coal.Capsule(thin, 1.0)
+    others = [
+        (rod, pin.SE3(along, across + [0, 0.3, 0]), 0.3),  # parallel, overlapping
+        (rod, pin.SE3(along, behind + [0, 0.4, 0]), np.hypot(2, 0.4)),  # parallel, behind
+        (rod, pin.SE3(turned, 0.2 * above), 0.2),  # crossing above
+        (ball, pin.SE3(np.eye(3), np.array([1.5, 2, 0])), np.hypot(1, 2)),  # a point
+    ]
+    for shape, placement, expected in others:
+        for pair in ((0, 1), (1, 0)):
+            shapes, placements = [rod, shape], [pin.SE3(along, np.zeros(3)), placement]
+            bodies = bounding_bodies([shapes[i] for i in pair], [placements[i] for i in pair], np.array([0, 1]), 2)
+            R, p = (np.stack(column) for column in zip(arrays(still(1)), arrays(still(1)), strict=True))
+            found = near_each_other(follow(R, p, np.zeros((2, 3))), bodies, np.array([[0, 1]]), 10.0)
+            np.testing.assert_allclose(found.bounds, expected, atol=3 * thin)
 
 
 def test_heights_are_those_of_the_lowest_points():
     random = np.random.default_rng(1)
-    motion = walk(random, 30, 0.3)
-    R, p = arrays(motion)
-    ends, radius = bounding_capsule(SHAPES["capsule"])
-    capsules = Capsules(np.zeros(1, np.int64), ends[None], np.array([radius]))
-    world = tracks(R[None], p[None], capsules)
+    samples, horizon = 30, 0.2
+    motions = [still(samples), walk(random, samples, 0.3), walk(random, samples, 0.2)]
+    bodies, R, p, placed = on_links([SHAPES["capsule"], SHAPES["box"]], [1, 1], motions)
     ground = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-    expected = [distance(SHAPES["capsule"], T, ground, pin.SE3.Identity()) for T in motion]
-    np.testing.assert_allclose(heights(world.ends, capsules.radii, np.zeros(1, np.int64))[0], expected, atol=1e-12)
+    world = follow(R, p, bodies.link_ends.mean(axis=1))
+    shapes, everywhere = [SHAPES["capsule"], SHAPES["box"]], np.ones(samples, dtype=bool)
+    exact = {
+        (i, -1): np.array([distance(shapes[i], T, ground, pin.SE3.Identity()) for T in placed[i]]) for i in range(2)
+    }
+    bounds = check(near_ground(world, bodies, horizon), exact, horizon, everywhere)
+    known = bounds[0, -1] < np.inf
+    assert known.any()
+    np.testing.assert_allclose(bounds[0, -1][known], exact[0, -1][known], atol=1e-12)
     half = np.array([0.01, 0.07, 0.03])
-    rows = box_heights(R[2], p[2], -half[None], half[None], 4)
-    expected = [distance(SHAPES["box"], T, ground, pin.SE3.Identity()) for T in motion]
-    assert np.isposinf(rows[0, :4]).all()
-    np.testing.assert_allclose(rows[0, 4:], expected[4:], atol=1e-12)
+    pieces: Pieces = boxes_around([np.vstack([-half, half])], 5)
+    found = pieces_near_ground(world, pieces, 4, horizon)
+    exact = {(5, -1): np.array([distance(SHAPES["box"], T, ground, pin.SE3.Identity()) for T in motions[-1]])}
+    bounds = check(found, exact, horizon, np.arange(samples) >= 4)
+    known = bounds[5, -1] < np.inf
+    np.testing.assert_allclose(bounds[5, -1][known], exact[5, -1][known], atol=1e-12)
+
+
+def test_volumes_around_links_contain_their_bodies():
+    shapes = list(SHAPES.values())
+    bodies, _, _, placed = on_links(shapes, [1, 1, 2, 2, 2, 1], [still(1)] * 3)
+    middles = bodies.link_ends.mean(axis=1)
+    for direction in np.random.default_rng(0).normal(size=(100, 3)):
+        direction /= np.linalg.norm(direction)
+        plane = coal.Halfspace(direction, 0.0)
+        for b, (shape, (T,)) in enumerate(zip(shapes, placed, strict=True)):
+            low, k = distance(shape, T, plane, pin.SE3.Identity()), bodies.links[b]
+            assert (bodies.link_ends[k] @ direction).min() - bodies.link_radii[k] <= low + 1e-12
+            assert middles[k] @ direction - bodies.reaches[b] <= low + 1e-12
+            rounded = bodies.ends[b].mean(axis=0) @ direction - np.abs(bodies.halves[b] @ direction).sum()
+            assert rounded - bodies.rounding[b] <= low + 1e-12

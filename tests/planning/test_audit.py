@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from dyngrasp.models.distance_bounds import Capsules
 from dyngrasp.planning.audit import audit, standstill
-from dyngrasp.planning.clearance import cell_geometry
+from dyngrasp.planning.cell_geometry import cell_geometry
+from dyngrasp.planning.part_motion import part_motion, part_poses
 from dyngrasp.planning.plan_samples import SUBSTEPS
 from dyngrasp.planning.problem import AuditEntry
 from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
@@ -230,11 +230,8 @@ def grown(task, targets, name: str, radius: float):
     """The same task with one body of arm or hand replaced by a larger ball."""
     fresh = replace(task)
     cell = cell_geometry(fresh, targets.grasp.name)
-    i = cell.names.index(name)
-    cell.shapes[i] = coal.Sphere(radius)
-    ends, radii = cell.capsules.ends.copy(), cell.capsules.radii.copy()
-    ends[i], radii[i] = ends[i].mean(axis=0), radius
-    cell.capsules = Capsules(cell.capsules.links, ends, radii)
+    cell.shapes[cell.names.index(name)] = coal.Sphere(radius)
+    cell.refresh()
     return fresh
 
 
@@ -244,7 +241,8 @@ def hanging_lower(task, targets):
     cell = cell_geometry(fresh, targets.grasp.name)
     down = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.002]))
     part_in_grasp = targets.grasp.T_object_grasp.inverse()
-    cell.T_flange_object = cell.T_flange_object * part_in_grasp.inverse() * down * part_in_grasp
+    cell.T_flange_part = cell.T_flange_part * part_in_grasp.inverse() * down * part_in_grasp
+    cell.refresh()
     return fresh
 
 
@@ -356,10 +354,13 @@ def test_a_moving_part_is_followed(plan, targets, task):
     T, twist = targets.T_world_object, np.array([0.1, -0.2, 0.05, 0.3, -0.4, 0.5])
     moving = replace(targets, grasp_time=2.0, twist_world=twist)
     times = np.array([0.0, 1.3, 2.0, 2.5])
-    for R, p, t in zip(*moving.part_poses(times), times, strict=True):
-        expected = moving.T_world_object_at(t)
-        np.testing.assert_allclose(R, expected.rotation, atol=1e-14)
-        np.testing.assert_allclose(p, expected.translation, atol=1e-14)
+    for part in (moving, replace(moving, twist_world=np.array([0.1, 0, 0, 0, 0, 0])), targets):
+        R, p = np.empty((3, 3, 4)), np.empty((3, 4))
+        part_poses(*part_motion(part), times, R, p)
+        for k, t in enumerate(times):
+            expected = part.T_world_object_at(t)
+            np.testing.assert_allclose(R[..., k], expected.rotation, atol=1e-14)
+            np.testing.assert_allclose(p[:, k], expected.translation, atol=1e-14)
     assert moving.T_world_object_at(2.5) == T
 
 

@@ -11,16 +11,10 @@ import pytest
 import trimesh
 
 from dyngrasp.models.assembly import assemble
-from dyngrasp.planning import clearance
-from dyngrasp.planning.clearance import (
-    HORIZON,
-    JOINT_STEP,
-    RESOLUTION,
-    Waypoints,
-    cell_geometry,
-    clearance_entries,
-    waypoints_of,
-)
+from dyngrasp.planning.cell_geometry import cell_geometry
+from dyngrasp.planning.clearance import HORIZON, RESOLUTION, clearance_entries
+from dyngrasp.planning.part_motion import part_motion
+from dyngrasp.planning.plan_samples import JOINT_STEP, Waypoints, waypoints_of
 from dyngrasp.trajectory import PHASE_NAMES
 
 
@@ -80,6 +74,11 @@ def convex(path) -> coal.Convex:
     return coal.Convex(points, faces)
 
 
+def at_once(q, task):
+    """One sample of the arm at q with the open hand, the part standing."""
+    return Waypoints(np.zeros(1), q[:, None], task.gripper.open_posture[:, None], 1, 1)
+
+
 def with_times(waypoints, keep):
     """Some of the samples, by index."""
     closing, lifted = (int((np.asarray(keep) < k).sum()) for k in (waypoints.closing, waypoints.lifted))
@@ -123,10 +122,11 @@ def test_entry_says_where_and_who(task, targets, plan):
         one, other = entry.detail.split(" and ")
         at = []
         for k in np.flatnonzero(np.abs(waypoints.times - entry.time) < 1e-12):
-            R, p = cell.poses(waypoints.q[:, [k]], waypoints.q_h[:, [k]])
-            for T in (targets.T_world_object, pin.SE3(R[-1, ..., 0], p[-1, :, 0]) * cell.T_flange_object):
-                scene = clearance.Scene(R, p, T.rotation[..., None], T.translation[:, None], 0, 0)
-                at.append(cell.distance(cell.names.index(one), cell.names.index(other), scene, 0))
+            # The part, at a join, still stands or already hangs.
+            for lifted in (0, 1):
+                single = Waypoints(waypoints.times[[k]], waypoints.q[:, [k]], waypoints.q_h[:, [k]], 0, lifted)
+                poses = cell.poses(single, part_motion(targets))
+                at.append(cell.distance(cell.names.index(one), cell.names.index(other), *poses, 0))
         assert np.abs(np.array(at) - entry.worst).min() < 2 * RESOLUTION
 
 
@@ -145,14 +145,13 @@ def test_distances_are_mujocos(task, targets):
         q = random.uniform(limits.position_lower, limits.position_upper)
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
-        R, p = cell.poses(q[:, None], task.gripper.open_posture[:, None])
-        scene = clearance.Scene(R, p, np.eye(3)[..., None], np.zeros((3, 1)), 0, 0)
+        poses = cell.poses(at_once(q, task), part_motion(targets))
         for i, j in itertools.combinations(arm, 2):
             expected = mujoco.mj_geomDistance(model, data, names[cell.names[i]], names[cell.names[j]], 2.0, None)
             if expected > 0:
                 apart += 1
                 # MuJoCo's own iterations stop at 1e-6.
-                assert cell.distance(i, j, scene, 0) == pytest.approx(expected, abs=5e-6), (
+                assert cell.distance(i, j, *poses, 0) == pytest.approx(expected, abs=5e-6), (
                     cell.names[i],
                     cell.names[j],
                 )
@@ -162,15 +161,14 @@ def test_distances_are_mujocos(task, targets):
 def test_pieces_and_ground_where_the_answer_is_known(task, targets):
     """The lowest vertex of each piece over the ground, for tilted parts."""
     cell = cell_geometry(task, targets.grasp.name)
-    R, p = cell.poses(task.place[:, None], task.gripper.open_posture[:, None])
     random = np.random.default_rng(1)
     for _ in range(5):
         T = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.2)
-        scene = clearance.Scene(R, p, T.rotation[..., None], T.translation[:, None], 0, 0)
+        poses = cell.poses(at_once(task.place, task), part_motion(replace(targets, T_world_object=T)))
         for i, path in enumerate(task.grasp_object.piece_paths):
             vertices = np.asarray(trimesh.load_mesh(path).vertices)
             expected = (vertices @ T.rotation.T + T.translation)[:, 2].min()
-            found = cell.distance(len(cell.links) + i, cell.ground, scene, 0)
+            found = cell.distance(cell.first_piece + i, cell.ground, *poses, 0)
             assert found == pytest.approx(expected, abs=1e-7)
 
 

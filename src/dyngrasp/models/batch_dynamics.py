@@ -99,6 +99,10 @@ class BatchModel:
             frames.links, frames.rotations, frames.positions,
         )  # fmt: skip
 
+    def link_poses(self, q: Array, R: Array, p: Array) -> None:
+        """Write the poses of all turned joint frames in the world into R (n, 3, 3, M) and p (n, 3, M), for q (n, M)."""
+        _link_poses(*cosine_sine(q), self.parents, self.rotations, self.offsets, R, p)
+
     def inverse_dynamics(self, q: Array, w: Array, v: Array) -> tuple[Array, Array]:
         """Recursive Newton-Euler for a chain (each joint on the link before it); q, w, v (n, M).
 
@@ -174,9 +178,8 @@ def cosine_sine(angles):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _poses(cosine, sine, parents, rotations, offsets, links, link_rotations, link_positions):
+def _link_poses(cosine, sine, parents, rotations, offsets, R, p):
     n, samples = cosine.shape
-    R, p = np.empty((n, 3, 3, samples)), np.empty((n, 3, samples))
     for i in range(n):
         fixed, offset = rotations[i], offsets[i]
         if parents[i] < 0:
@@ -185,11 +188,18 @@ def _poses(cosine, sine, parents, rotations, offsets, links, link_rotations, lin
                 for b in range(3):
                     R[i, a, b] = fixed[a, b]
         else:
-            _compose(R[parents[i]], p[parents[i]], fixed, offset, R[i], p[i])
+            compose(R[parents[i]], p[parents[i]], fixed, offset, R[i], p[i])
         for a in range(3):
             x, y = R[i, a, 0], R[i, a, 1]
             for s in range(samples):
                 x[s], y[s] = cosine[i, s] * x[s] + sine[i, s] * y[s], cosine[i, s] * y[s] - sine[i, s] * x[s]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _poses(cosine, sine, parents, rotations, offsets, links, link_rotations, link_positions):
+    n, samples = cosine.shape
+    R, p = np.empty((n, 3, 3, samples)), np.empty((n, 3, samples))
+    _link_poses(cosine, sine, parents, rotations, offsets, R, p)
     frames = links.size
     out_R, out_p = np.empty((frames, 3, 3, samples)), np.empty((frames, 3, samples))
     for f in range(frames):
@@ -199,12 +209,12 @@ def _poses(cosine, sine, parents, rotations, offsets, links, link_rotations, lin
                 for b in range(3):
                     out_R[f, a, b] = link_rotations[f, a, b]
         else:
-            _compose(R[links[f]], p[links[f]], link_rotations[f], link_positions[f], out_R[f], out_p[f])
+            compose(R[links[f]], p[links[f]], link_rotations[f], link_positions[f], out_R[f], out_p[f])
     return out_R, out_p
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _compose(R, p, turn, shift, out_R, out_p):
+def compose(R, p, turn, shift, out_R, out_p):
     """(R, p) · (turn, shift) for samples of R (3, 3, M), p (3, M) and one fixed pose."""
     for a in range(3):
         x, y, z, origin = R[a, 0], R[a, 1], R[a, 2], p[a]
@@ -234,7 +244,7 @@ def _newton_euler(cosine, sine, w, v, rotations, offsets, mass, first_moment, in
                 E[i, a, 1, s] = cosine[i, s] * y - sine[i, s] * x
         _to_child(E[i], offsets[i], w[i], v[i], motion, moved)
         motion, moved = moved, motion
-        _newton(mass[i], first_moment[i], inertia[i], motion, wrench[i])
+        newton(mass[i], first_moment[i], inertia[i], motion, wrench[i])
     torque = np.empty((n, samples))
     for i in range(n - 1, -1, -1):
         for s in range(samples):
@@ -270,7 +280,7 @@ def _to_child(E, offset, rate, acceleration, motion, out):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _newton(mass, h, inertia, motion, out):
+def newton(mass, h, inertia, motion, out):
     """Force and moment about the origin, for the motion (o, l, a) of a link with h = mass times centre of mass.
 
     f = m a + l × h + o × (o × h),  n = I l + o × I o + h × a.
@@ -310,5 +320,5 @@ def _to_parent(E, offset, wrench, out):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _wrench(motion, mass, first_moment, inertia):
     out = np.empty((6, motion.shape[1]))
-    _newton(mass, first_moment, inertia, motion, out)
+    newton(mass, first_moment, inertia, motion, out)
     return out

@@ -1,340 +1,316 @@
-"""Cheap lower bounds of the distance between bodies that move, for many samples at once, compiled.
+"""Which bodies may come near each other as they move, and how near at least: for many samples at once, compiled.
 
-A body is bounded by a capsule (a segment with a radius), a convex piece by the box along its own axes. What a body can
-have moved from one sample to another bounds how much any of its distances can have changed: after a sample that is far
-the next ones are skipped, and one exact distance says something about its neighbours.
+How far a body can have moved from one sample to another bounds how much any of its distances can have changed: after a
+sample that is far the next ones are skipped, and one exact distance says something about its neighbours. All bodies of
+a link are first looked at as one.
 
 Bounds hold for signed distances: a penetration counts negative with the depth by which the bodies would have to part.
+Links, samples and volumes are those of `bounding_volumes`; the link with index 0 is the world.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from dyngrasp.models.bounding_volumes import Bodies, Pieces, gap, lowest_corner, segment_distance
+from dyngrasp.models.link_motion import Motion, next_beyond, path_of, placed, span
 from dyngrasp.signals import Array
 
-# A path this short (m) is none: far below what any of the distances is known to.
-STILL = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
-class Capsules:
-    """Bounding capsules of B bodies.
+class Candidates:
+    """K pairs of bodies that may come near, and lower bounds of their distance at some samples.
+
+    At the samples that are not among those of a pair it is farther apart than asked for, or does not count.
 
     Attributes:
-        links: (B,) index of the frame that each is fixed to.
-        ends: (B, 2, 3) ends of the segments in that frame (m).
-        radii: (B,) m.
+        pairs: (K, 2) bodies by number.
+        stops: (K + 1,) where the samples of a pair end, those of the next one begin; 0 first.
+        samples: (E,) of one pair after the other.
+        bounds: (E,) m.
     """
 
-    links: NDArray[np.int64]
-    ends: Array
-    radii: Array
+    pairs: NDArray[np.int64]
+    stops: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    bounds: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Tracks:
-    """How B bodies move through S samples, seen from one frame.
-
-    Attributes:
-        ends: (B, 2, 3, S) ends of the segments (m).
-        travel: (B, S) path that the fastest point of each body has covered since the first sample, at most (m).
-    """
-
-    ends: Array
-    travel: Array
+def near_ground(motion: Motion, bodies: Bodies, horizon: float) -> Candidates:
+    """Bodies on moving links that may be lower than `horizon` (m), each paired with the ground: number −1."""
+    return Candidates(
+        *_near_ground(
+            motion.R, motion.p, motion.shift, motion.turn, bodies.members, bodies.firsts, bodies.ends, bodies.radii,
+            bodies.reaches, bodies.link_ends, bodies.link_radii, bodies.link_reaches, horizon,
+        )
+    )  # fmt: skip
 
 
-def bounding_capsule(shape: Any) -> tuple[Array, float]:
-    """Segment ends (2, 3) and radius (m), in the frame of the shape, of a capsule that contains it.
+def pieces_near_ground(motion: Motion, pieces: Pieces, start: int, horizon: float) -> Candidates:
+    """Pieces of the last link that may be lower than `horizon` (m) from sample `start` on; the ground is number −1."""
+    return Candidates(
+        *_pieces_near_ground(
+            motion.R[-1, 2], motion.p[-1, 2], motion.shift[-1], motion.turn[-1], pieces.low, pieces.high,
+            pieces.around, pieces.reaches, pieces.first, start, horizon,
+        )
+    )  # fmt: skip
+
+
+def near_pieces(
+    motion: Motion, bodies: Bodies, pieces: Pieces, starts: NDArray[np.int64], stops: NDArray[np.int64], horizon: float
+) -> Candidates:
+    """Bodies that may come nearer than `horizon` to pieces.
 
     Args:
-        shape: A primitive or a mesh of Coal.
-    """
-    if isinstance(shape, coal.Capsule | coal.Cylinder):
-        return _along(2, shape.halfLength), float(shape.radius)
-    if isinstance(shape, coal.Sphere):
-        return np.zeros((2, 3)), float(shape.radius)
-    if isinstance(shape, coal.Box):
-        half = np.asarray(shape.halfSide, dtype=float).ravel()
-        longest = int(np.argmax(half))
-        return _along(longest, half[longest]), float(np.linalg.norm(np.delete(half, longest)))
-    if isinstance(shape, coal.Ellipsoid):
-        radii = np.asarray(shape.radii, dtype=float).ravel()
-        longest, second = int(np.argmax(radii)), float(np.sort(radii)[1])
-        return _along(longest, radii[longest] - second), second
-    points = np.asarray(shape.points() if isinstance(shape, coal.ConvexBase) else shape.vertices(), dtype=float)
-    centre = points.mean(axis=0)
-    axis = np.linalg.svd(points - centre, full_matrices=False)[2][0]
-    along = (points - centre) @ axis
-    radius = np.linalg.norm(points - centre - along[:, None] * axis, axis=1).max()
-    return centre + np.array([[along.min()], [along.max()]]) * axis, float(radius)
-
-
-def _along(axis: int, half: float) -> Array:
-    ends = np.zeros((2, 3))
-    ends[:, axis] = -half, half
-    return ends
-
-
-def tracks(R: Array, p: Array, capsules: Capsules) -> Tracks:
-    """How bodies move in the frame in which the poses of their links are given.
-
-    Args:
-        R: (L, 3, 3, S) rotations of the links.
-        p: (L, 3, S) their positions (m).
-        capsules: The bodies.
-    """
-    return Tracks(*_tracks(R, p, capsules.links, capsules.ends, capsules.radii))
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def seen_from(R_view, p_view, R, p):
-    """Poses of links (L, 3, 3, S), (L, 3, S) as seen from a frame that moves too, (3, 3, S), (3, S)."""
-    turned, shifted = np.empty(R.shape), np.empty(p.shape)
-    samples = p.shape[2]
-    for k in range(R.shape[0]):
-        for a in range(3):
-            x, y, z = R_view[0, a], R_view[1, a], R_view[2, a]
-            for s in range(samples):
-                shifted[k, a, s] = (
-                    x[s] * (p[k, 0, s] - p_view[0, s])
-                    + y[s] * (p[k, 1, s] - p_view[1, s])
-                    + z[s] * (p[k, 2, s] - p_view[2, s])
-                )
-            for b in range(3):
-                for s in range(samples):
-                    turned[k, a, b, s] = x[s] * R[k, 0, b, s] + y[s] * R[k, 1, b, s] + z[s] * R[k, 2, b, s]
-    return turned, shifted
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _tracks(R, p, links, body_ends, radii):
-    count, samples = R.shape[0], R.shape[3]
-    # 2 sin(θ/2) of the turn of a link since the sample before: its Frobenius norm over √2.
-    turn = np.zeros((count, samples))
-    for k in range(count):
-        for a in range(3):
-            for b in range(3):
-                _add_squared_steps(R[k, a, b], turn[k])
-        for s in range(samples):
-            turn[k, s] = np.sqrt(turn[k, s] / 2)
-    ends, travel, step = np.empty((links.size, 2, 3, samples)), np.zeros((links.size, samples)), np.empty((2, samples))
-    for i in range(links.size):
-        k = links[i]
-        step[:] = 0.0
-        for e in range(2):
-            t = body_ends[i, e]
-            for a in range(3):
-                x, y, z, origin = R[k, a, 0], R[k, a, 1], R[k, a, 2], p[k, a]
-                row = ends[i, e, a]
-                for s in range(samples):
-                    row[s] = origin[s] + x[s] * t[0] + y[s] * t[1] + z[s] * t[2]
-                _add_squared_steps(row, step[e])
-        # Displacement is affine in the point, so within the segment it is largest at an end.
-        path = 0.0
-        for s in range(samples):
-            path += np.sqrt(max(step[0, s], step[1, s])) + radii[i] * turn[k, s]
-            travel[i, s] = path
-    return ends, travel
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
-def _add_squared_steps(row, total):
-    """total[s] += (row[s] − row[s − 1])², from the second sample on."""
-    for s in range(1, row.size):
-        total[s] += (row[s] - row[s - 1]) ** 2
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _box_gap(ends, s, low, high):
-    """Distance between the box around the segment at sample s and a box; −inf if they overlap."""
-    gap = 0.0
-    for a in range(3):
-        u, v = ends[0, a, s], ends[1, a, s]
-        d = max(low[a] - max(u, v), min(u, v) - high[a], 0.0)
-        gap += d * d
-    # How deep two bodies are in each other, overlapping boxes do not say.
-    return np.sqrt(gap) if gap > 0.0 else -np.inf
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _first_beyond(travel, start, stop, reach):
-    """First sample from `start` on, or `stop`, at which a path (S,), which never shrinks, exceeds `reach`."""
-    low, high = start, stop
-    while low < high:
-        middle = (low + high) // 2
-        if travel[middle] <= reach:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, error_model="numpy")
-def near_boxes(ends, travel, radii, bodies, starts, stops, low, high, horizon):
-    """Pairs of a body and a box that may come nearer than `horizon`, and lower bounds for them.
-
-    Args:
-        ends: Of the `Tracks` in the frame of the boxes.
-        travel: Of the same.
-        radii: (B,) m.
-        bodies: (K,) which bodies.
-        starts: (K,) first sample that counts for each of them.
-        stops: (K,) one after the last.
-        low: (P, 3) lower corners of the boxes (m).
-        high: (P, 3) upper corners (m).
+        motion: As seen from the part.
+        bodies: Volumes around the bodies.
+        pieces: Boxes around the pieces.
+        starts: (B,) first sample that counts for each body.
+        stops: (B,) one after the last.
         horizon: m.
-
-    Returns:
-        Bodies, boxes, bounds (rows, S), inf where a sample does not count or is known to be farther than the horizon.
     """
-    samples, count = travel.shape[1], low.shape[0]
-    rows = np.empty((bodies.size * count, samples))
-    first, second = np.empty(bodies.size * count, np.int64), np.empty(bodies.size * count, np.int64)
-    around_low, around_high = np.empty(3), np.empty(3)
-    for a in range(3):
-        around_low[a], around_high[a] = low[:, a].min(), high[:, a].max()
-    used = 0
-    for n in range(bodies.size):
-        b = bodies[n]
-        comes_near = False
-        s = begin = starts[n]
-        while s < stops[n] and not comes_near:
-            room = _box_gap(ends[b], s, around_low, around_high) - radii[b] - horizon
-            comes_near = not room >= 0.0
-            begin = s
-            s = _first_beyond(travel[b], s + 1, stops[n], travel[b, s] + room)
-        if not comes_near:
+    return Candidates(
+        *_near_pieces(
+            motion.R, motion.p, motion.shift, motion.turn, bodies.members, bodies.firsts, bodies.ends, bodies.halves,
+            bodies.rounding, bodies.reaches, bodies.link_ends, bodies.link_radii, bodies.link_reaches,
+            pieces.low, pieces.high, pieces.around, pieces.first, starts, stops, horizon,
+        )
+    )  # fmt: skip
+
+
+def near_each_other(motion: Motion, bodies: Bodies, link_pairs: NDArray[np.int64], horizon: float) -> Candidates:
+    """Bodies, one on each of a pair of links (Q, 2), that may come nearer than `horizon` (m)."""
+    return Candidates(
+        *_near_each_other(
+            motion.R, motion.p, motion.shift, motion.turn, bodies.members, bodies.firsts, bodies.ends, bodies.radii,
+            bodies.reaches, bodies.link_ends, bodies.link_radii, bodies.link_reaches, link_pairs, horizon,
+        )
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _near_ground(
+    R, p, shift, turn, members, firsts, ends, radii, reaches, link_ends, link_radii, link_reaches, horizon
+):
+    samples = p.shape[2]
+    pairs, stops, at, bounds = _space(radii.size, samples)
+    n = e = 0
+    for k in range(1, link_radii.size):
+        if firsts[k] == firsts[k + 1]:
             continue
-        for i in range(count):
-            row = rows[used]
-            keep = False
-            s = begin
-            while s < stops[n]:
-                bound = _box_gap(ends[b], s, low[i], high[i]) - radii[b]
-                if bound < horizon:
-                    if not keep:
-                        row[:] = np.inf
-                    row[s] = bound
-                    keep = True
-                # While the body stays where it is, so does its distance.
-                room = max(bound - horizon, STILL)
-                s = _first_beyond(travel[b], s + 1, stops[n], travel[b, s] + room)
-            if keep:
-                first[used], second[used] = b, i
-                used += 1
-    return first[:used], second[:used], rows[:used]
-
-
-@njit(cache=True, error_model="numpy")
-def near_capsules(ends, travel, radii, first, second, horizon):
-    """Pairs of bodies (K,), (K,) that may come nearer to each other than `horizon`; as `near_boxes`."""
-    samples = travel.shape[1]
-    rows, path = np.empty((first.size, samples)), np.empty(samples)
-    kept = np.empty(first.size, np.int64)
-    used = 0
-    for n in range(first.size):
-        i, k = first[n], second[n]
-        row = rows[used]
-        keep = False
-        for s in range(samples):
-            path[s] = travel[i, s] + travel[k, s]
-        s = 0
-        while s < samples:
-            bound = _segment_distance(ends[i], ends[k], s) - radii[i] - radii[k]
+        segment, path = placed(R[k], p[k], link_ends[k]), path_of(shift[k], turn[k], link_reaches[k])
+        begin = 0
+        while begin < samples:
+            bound = min(segment[0, 2, begin], segment[1, 2, begin]) - link_radii[k]
             if bound < horizon:
-                if not keep:
-                    row[:] = np.inf
-                row[s] = bound
-                keep = True
-            s = _first_beyond(path, s + 1, samples, path[s] + max(bound - horizon, STILL))
-        if keep:
-            kept[used] = n
-            used += 1
-    return kept[:used], rows[:used]
+                break
+            begin = next_beyond(path, begin, samples, bound - horizon)
+        if begin >= samples:
+            continue
+        for m in range(firsts[k], firsts[k + 1]):
+            b = members[m]
+            segment, path = placed(R[k], p[k], ends[b]), path_of(shift[k], turn[k], reaches[b])
+            s = begin
+            while s < samples:
+                bound = min(segment[0, 2, s], segment[1, 2, s]) - radii[b]
+                if bound < horizon:
+                    at[e], bounds[e] = s, bound
+                    e += 1
+                s = next_beyond(path, s, samples, bound - horizon)
+            n = _finish(pairs, stops, n, e, b, -1)
+    return pairs[:n], stops[: n + 1], at[:e], bounds[:e]
 
 
 @njit(cache=True, error_model="numpy")
-def _segment_distance(one, other, s):
-    """Distance of two segments at sample s: where the lines come nearest, each parameter clamped in turn."""
-    px, py, pz = one[0, 0, s], one[0, 1, s], one[0, 2, s]
-    ux, uy, uz = one[1, 0, s] - px, one[1, 1, s] - py, one[1, 2, s] - pz
-    qx, qy, qz = other[0, 0, s], other[0, 1, s], other[0, 2, s]
-    vx, vy, vz = other[1, 0, s] - qx, other[1, 1, s] - qy, other[1, 2, s] - qz
-    wx, wy, wz = px - qx, py - qy, pz - qz
-    a, e = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
-    b, c, f = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
-    denominator = a * e - b * b
-    x = 0.0
-    if a > 0.0:
-        # Parallel segments: any start serves, the clamping below finds the nearest pair.
-        x = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 1e-14 * a * e else 0.0
-    y = (b * x + f) / e if e > 0.0 else 0.0
-    if y < 0.0 or y > 1.0 or e == 0.0:
-        y = min(max(y, 0.0), 1.0)
-        x = min(max((b * y - c) / a, 0.0), 1.0) if a > 0.0 else 0.0
-    dx, dy, dz = wx + x * ux - y * vx, wy + x * uy - y * vy, wz + x * uz - y * vz
-    return np.sqrt(dx * dx + dy * dy + dz * dz)
+def _pieces_near_ground(up, origin, shift, turn, low, high, around, reaches, number, start, horizon):
+    samples = origin.size
+    pairs, stops, at, bounds = _space(reaches.size, samples)
+    n = e = 0
+    path, begin = path_of(shift, turn, reaches.max()), start
+    while begin < samples:
+        bound = lowest_corner(up, origin, around[0], around[1], begin)
+        if bound < horizon:
+            break
+        begin = next_beyond(path, begin, samples, bound - horizon)
+    if begin < samples:
+        for i in range(reaches.size):
+            path, s = path_of(shift, turn, reaches[i]), begin
+            while s < samples:
+                bound = lowest_corner(up, origin, low[i], high[i], s)
+                if bound < horizon:
+                    at[e], bounds[e] = s, bound
+                    e += 1
+                s = next_beyond(path, s, samples, bound - horizon)
+            n = _finish(pairs, stops, n, e, number + i, -1)
+    return pairs[:n], stops[: n + 1], at[:e], bounds[:e]
 
 
 @njit(cache=True, error_model="numpy")
-def heights(ends, radii, bodies):
-    """(K, S) height of the lowest point of the capsules of some bodies, seen from the world."""
-    rows = np.empty((bodies.size, ends.shape[3]))
-    for n in range(bodies.size):
-        b = bodies[n]
-        for s in range(ends.shape[3]):
-            rows[n, s] = min(ends[b, 0, 2, s], ends[b, 1, 2, s]) - radii[b]
-    return rows
+def _near_pieces(
+    R, p, shift, turn, members, firsts, ends, halves, rounding, reaches, link_ends, link_radii, link_reaches,
+    low, high, around, number, starts, lasts, horizon,
+):  # fmt: skip
+    samples, count = p.shape[2], low.shape[0]
+    pairs, stops, at, bounds = _space(reaches.size * count, samples)
+    n = e = 0
+    own_low, own_high, half = np.empty((3, samples)), np.empty((3, samples)), np.zeros((3, 3))
+    for k in range(link_radii.size):
+        begin, end = samples, 0
+        for m in range(firsts[k], firsts[k + 1]):
+            b = members[m]
+            if starts[b] < lasts[b]:
+                begin, end = min(begin, starts[b]), max(end, lasts[b])
+        if begin >= end:
+            continue
+        for a in range(3):
+            half[0, a] = (link_ends[k, 1, a] - link_ends[k, 0, a]) / 2
+        span(R[k], p[k], link_ends[k], half, own_low, own_high, begin, end)
+        path = path_of(shift[k], turn[k], link_reaches[k])
+        while begin < end:
+            bound = gap(own_low, own_high, begin, around[0], around[1]) - link_radii[k]
+            if bound < horizon:
+                break
+            begin = next_beyond(path, begin, end, bound - horizon)
+        if begin >= end:
+            continue
+        for m in range(firsts[k], firsts[k + 1]):
+            b = members[m]
+            first, last = max(begin, starts[b]), lasts[b]
+            if first >= last:
+                continue
+            span(R[k], p[k], ends[b], halves[b], own_low, own_high, first, last)
+            path = path_of(shift[k], turn[k], reaches[b])
+            while first < last:
+                bound = gap(own_low, own_high, first, around[0], around[1]) - rounding[b]
+                if bound < horizon:
+                    break
+                first = next_beyond(path, first, last, bound - horizon)
+            if first >= last:
+                continue
+            for i in range(count):
+                s = first
+                while s < last:
+                    bound = gap(own_low, own_high, s, low[i], high[i]) - rounding[b]
+                    if bound < horizon:
+                        at[e], bounds[e] = s, bound
+                        e += 1
+                    s = next_beyond(path, s, last, bound - horizon)
+                n = _finish(pairs, stops, n, e, b, number + i)
+    return pairs[:n], stops[: n + 1], at[:e], bounds[:e]
 
 
 @njit(cache=True, error_model="numpy")
-def box_heights(up, origin, low, high, start):
-    """(P, S) height of the lowest corner of boxes (P, 3), (P, 3) in a frame; inf before sample `start`.
+def _near_each_other(
+    R, p, shift, turn, members, firsts, ends, radii, reaches, link_ends, link_radii, link_reaches, link_pairs, horizon
+):
+    samples, links = p.shape[2], link_radii.size
+    pairs, stops, at, bounds = _space(radii.size**2 // 2, samples)
+    n = e = 0
+    around, paths = np.empty((links, 2, 3, samples)), np.empty((links, samples))
+    for k in range(links):
+        if firsts[k] < firsts[k + 1]:
+            around[k], paths[k] = placed(R[k], p[k], link_ends[k]), path_of(shift[k], turn[k], link_reaches[k])
+    path = np.empty(samples)
+    for q in range(link_pairs.shape[0]):
+        j, k = link_pairs[q, 0], link_pairs[q, 1]
+        for s in range(samples):
+            path[s] = paths[j, s] + paths[k, s]
+        begin = 0
+        while begin < samples:
+            bound = segment_distance(around[j], around[k], begin) - link_radii[j] - link_radii[k]
+            if bound < horizon:
+                break
+            begin = next_beyond(path, begin, samples, bound - horizon)
+        if begin >= samples:
+            continue
+        for o in range(firsts[j], firsts[j + 1]):
+            b = members[o]
+            one, own = placed(R[j], p[j], ends[b]), path_of(shift[j], turn[j], reaches[b])
+            first = begin
+            for s in range(samples):
+                path[s] = own[s] + paths[k, s]
+            while first < samples:
+                bound = segment_distance(one, around[k], first) - radii[b] - link_radii[k]
+                if bound < horizon:
+                    break
+                first = next_beyond(path, first, samples, bound - horizon)
+            if first >= samples:
+                continue
+            for m in range(firsts[k], firsts[k + 1]):
+                c = members[m]
+                other, other_path = placed(R[k], p[k], ends[c]), path_of(shift[k], turn[k], reaches[c])
+                for s in range(samples):
+                    path[s] = own[s] + other_path[s]
+                s = first
+                while s < samples:
+                    bound = segment_distance(one, other, s) - radii[b] - radii[c]
+                    if bound < horizon:
+                        at[e], bounds[e] = s, bound
+                        e += 1
+                    s = next_beyond(path, s, samples, bound - horizon)
+                n = _finish(pairs, stops, n, e, b, c)
+    return pairs[:n], stops[: n + 1], at[:e], bounds[:e]
+
+
+@njit(cache=True, error_model="numpy")
+def tighten(samples, bounds, shift_one, turn_one, reach_one, shift_other, turn_other, reach_other, at, distance):
+    """Enter an exact distance into the bounds of one pair, as its neighbours see it; `at` itself is done (inf).
 
     Args:
-        up: (3, S) the world's z axis in that frame.
-        origin: (S,) height of its origin (m).
-        low: (P, 3) lower corners in that frame (m).
-        high: (P, 3) upper corners (m).
-        start: First sample that counts.
-    """
-    rows = np.full((low.shape[0], origin.size), np.inf)
-    for i in range(low.shape[0]):
-        for s in range(start, origin.size):
-            z = origin[s]
-            for a in range(3):
-                z += min(up[a, s] * low[i, a], up[a, s] * high[i, a])
-            rows[i, s] = z
-    return rows
-
-
-@njit(cache=True, error_model="numpy")
-def tighten(row, travel, at, distance):
-    """Enter an exact distance into a row of bounds, as its neighbours see it; `at` itself is done (inf).
-
-    Args:
-        row: (S,) bounds, changed in place.
-        travel: (S,) combined path of both bodies (m).
-        at: The sample that was measured.
+        samples: (E,) of the pair.
+        bounds: (E,) changed in place.
+        shift_one: (S,) path of the link of one body (m), of `Motion`.
+        turn_one: (S,) its turns.
+        reach_one: How far that body extends from the middle of its link (m).
+        shift_other: Of the other one.
+        turn_other: Of the other one.
+        reach_other: Of the other one.
+        at: Which of the samples was measured.
         distance: What was measured (m).
 
     Returns:
-        Least bound that is left, and where.
+        Which bound is now the least.
     """
-    row[at] = np.inf
-    least, where = np.inf, 0
-    for s in range(row.size):
-        bound = distance - abs(travel[s] - travel[at])
-        if bound > row[s]:
-            row[s] = bound
-        if row[s] < least:
-            least, where = row[s], s
-    return least, where
+    path, other = path_of(shift_one, turn_one, reach_one), path_of(shift_other, turn_other, reach_other)
+    here, least = path[samples[at]] + other[samples[at]], 0
+    bounds[at] = np.inf
+    for e in range(samples.size):
+        if e != at:
+            s = samples[e]
+            bounds[e] = max(bounds[e], distance - abs(path[s] + other[s] - here))
+        if bounds[e] < bounds[least]:
+            least = e
+    return least
+
+
+@njit(cache=True)
+def lowest(stops, bounds):
+    """(K,) which of the bounds (E,) of each pair is the lowest."""
+    least = stops[:-1].copy()
+    for k in range(least.size):
+        for e in range(stops[k], stops[k + 1]):
+            if bounds[e] < bounds[least[k]]:
+                least[k] = e
+    return least
+
+
+@njit(cache=True)
+def _space(most, samples):
+    """Arrays of `Candidates` for so many pairs; memory that is never written costs nothing."""
+    size = most * samples
+    stops = np.empty(most + 1, np.int64)
+    stops[0] = 0
+    return np.empty((most, 2), np.int64), stops, np.empty(size, np.int64), np.empty(size)
+
+
+@njit(cache=True, inline="always")
+def _finish(pairs, stops, n, e, one, other):
+    """Number of pairs after this one, which counts if there are bounds since the last."""
+    if e > stops[n]:
+        pairs[n, 0], pairs[n, 1], stops[n + 1] = one, other, e
+        return n + 1
+    return n

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True)
-class Pinch:
+class Pinch(NamedTuple):
     """Two pads that press a part between them. Entries may be numbers or CasADi symbols.
 
     Attributes:
@@ -23,7 +21,7 @@ class Pinch:
     width: Any
 
 
-def pad_loads(force: Any, moment: Any, pinch: Pinch) -> list[tuple[Any, Any]]:
+def pad_loads(force: Any, moment: Any, pinch: Pinch) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
     """How a wrench on the part is shared by the two pads, and what each can bear.
 
     In the grasp frame (x along the part, y across it from pad to pad, z outward) the pads at y = ±w/2 carry half of the
@@ -43,9 +41,7 @@ def pad_loads(force: Any, moment: Any, pinch: Pinch) -> list[tuple[Any, Any]]:
     fx, fy, fz = force[0], force[1], force[2]
     mx, my, mz = moment[0], moment[1], moment[2]
     N, mu, t, w = pinch.force, pinch.sliding, pinch.torsional, pinch.width
-    loads = []
-    for side in (-1.0, 1.0):
-        along_x, along_z = fx / 2 + side * mz / w, fz / 2 - side * mx / w
-        load = (along_x**2 + along_z**2) / (mu * N) ** 2 + (my / (2 * t * N)) ** 2
-        loads.append((load, 1.0 + side * fy / (2 * N)))
-    return loads
+    torsion, along_x, along_z = (my / (2 * t * N)) ** 2, mz / w, mx / w
+    left = ((fx / 2 - along_x) ** 2 + (fz / 2 + along_z) ** 2) / (mu * N) ** 2 + torsion
+    right = ((fx / 2 + along_x) ** 2 + (fz / 2 - along_z) ** 2) / (mu * N) ** 2 + torsion
+    return (left, 1.0 - fy / (2 * N)), (right, 1.0 + fy / (2 * N))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import casadi
 import numpy as np
@@ -192,8 +192,7 @@ class Solution:
         return self.trajectory
 
 
-@dataclass(frozen=True)
-class AuditEntry:
+class AuditEntry(NamedTuple):
     """The worst value of one constraint over a whole plan.
 
     Attributes:

@@ -1,0 +1,48 @@
+"""Where the part is until it is taken, for compiled code."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from dyngrasp.planning.grasp_targets import GraspTargets
+from dyngrasp.signals import Array
+
+PartMotion = tuple[Array, Array, Array, float]
+
+
+def part_motion(targets: GraspTargets) -> PartMotion:
+    """First arguments of `part_poses`, for the part that is to be grasped; `GraspTargets` says the same of one time."""
+    T = targets.T_world_object
+    return np.ascontiguousarray(T.rotation), np.array(T.translation), targets.twist_world, float(targets.grasp_time)
+
+
+@njit(cache=True, error_model="numpy")
+def part_poses(rotation, position, twist, arrival, times, R, p):
+    """Poses at some times of a part that keeps its velocities until it is taken.
+
+    Args:
+        rotation: (3, 3) at and after `arrival`, in the world.
+        position: (3,) then (m).
+        twist: (6,) velocity of its origin (m/s) and angular velocity (rad/s) before, world axes.
+        arrival: s. A part at rest has none.
+        times: (M,) s.
+        R: (3, 3, ≥ M) in which the rotations are written,
+        p: (3, ≥ M) and the positions (m).
+    """
+    x, y, z = twist[3], twist[4], twist[5]
+    rate = np.sqrt(x * x + y * y + z * z)
+    if rate > 0.0:
+        x, y, z = x / rate, y / rate, z / rate
+    moving = rate > 0.0 or twist[0] != 0.0 or twist[1] != 0.0 or twist[2] != 0.0
+    for s in range(times.size):
+        before = min(times[s] - arrival, 0.0) if moving else 0.0
+        c, d = np.sin(rate * before), 2.0 * np.sin(rate * before / 2.0) ** 2
+        for a in range(3):
+            p[a, s] = position[a] + before * twist[a]
+            u, v, w = rotation[0, a], rotation[1, a], rotation[2, a]
+            # Rodrigues: u + sin φ axis × u + (1 − cos φ) axis × (axis × u).
+            e, f, g = y * w - z * v, z * u - x * w, x * v - y * u
+            R[0, a, s] = u + c * e + d * (y * g - z * f)
+            R[1, a, s] = v + c * f + d * (z * e - x * g)
+            R[2, a, s] = w + c * g + d * (x * f - y * e)
