@@ -11,7 +11,7 @@ import pytest
 from dyngrasp.errors import ModelFileError
 from dyngrasp.models.assembly import assemble
 from dyngrasp.models.catalogue import GRIPPERS, load_gripper, load_robot
-from dyngrasp.models.gripper import read_gripper
+from dyngrasp.models.gripper_file import read_gripper
 from dyngrasp.models.robot import read_robot
 
 SDH2 = GRIPPERS["sdh2"] / "model.toml"

@@ -7,7 +7,7 @@ import pytest
 
 from dyngrasp.errors import GraspRefused, ModelFileError
 from dyngrasp.models.catalogue import GRIPPERS
-from dyngrasp.models.gripper import read_gripper
+from dyngrasp.models.gripper_file import read_gripper
 
 SDH2 = GRIPPERS["sdh2"] / "model.toml"
 

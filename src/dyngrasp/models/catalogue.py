@@ -13,7 +13,8 @@ from scipy.optimize import minimize
 
 from dyngrasp.errors import ModelFileError, UnknownName
 from dyngrasp.models.camera import CameraModel, read_camera
-from dyngrasp.models.gripper import GripperModel, read_gripper
+from dyngrasp.models.gripper import GripperModel
+from dyngrasp.models.gripper_file import read_gripper
 from dyngrasp.models.model_file import read_toml
 from dyngrasp.models.robot import RobotModel, read_robot
 from dyngrasp.signals import Array
