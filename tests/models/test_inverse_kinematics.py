@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.models.catalogue import load_robot
+from dyngrasp.models.damped_least_squares import DampedLeastSquares, DampedLeastSquaresSettings
 from dyngrasp.models.inverse_kinematics import (
-    DampedLeastSquares,
-    DampedLeastSquaresSettings,
     InverseKinematics,
     inverse_kinematics_for,
     joint_velocity,
