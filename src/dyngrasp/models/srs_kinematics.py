@@ -13,20 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
-from numba import njit
 
 from dyngrasp.errors import InvalidProblem, ModelFileError, OutOfReach
-from dyngrasp.models.srs_chain import (
-    ALIGNED,
-    BRANCHES,
-    ROUNDING,
-    ElbowCircle,
-    SrsChain,
-    arm_angle_of,
-    circle_at,
-    configurations,
-    joint_vector,
-)
+from dyngrasp.models.srs_chain import BRANCHES, ElbowCircle, SrsChain, joint_vector
+from dyngrasp.models.srs_search import configurations_within, follow_configuration, nearest_configuration
 from dyngrasp.signals import Array, read_only
 
 if TYPE_CHECKING:
@@ -35,10 +25,7 @@ if TYPE_CHECKING:
     from dyngrasp.models.limits import JointLimits
     from dyngrasp.models.robot import RobotModel
 
-__all__ = ["BRANCHES", "SrsKinematics", "SrsSolutions"]
-
-ARM_ANGLES = 72
-_REFINED = 4  # local minima on the grid of arm angles that are looked into
+ARM_ANGLES = 72  # of a grid over the full turn
 CHAIN_ROUNDING = 1e-9
 """Largest difference (m, rad) between the chain of a model file and the closed form: they must be the same arm."""
 
@@ -180,7 +167,7 @@ class SrsKinematics:
         """
         q_reference, q = joint_vector(q_reference), np.empty(7)
         limits = self.limits
-        if _follow(
+        if follow_configuration(
             T_world_flange.rotation, T_world_flange.translation, q_reference, self._chain.lengths, *self._reach,
             self._middle, limits.position_lower, limits.position_upper, q,
         ):  # fmt: skip
@@ -274,7 +261,7 @@ class SrsKinematics:
         weight, limits = 1.0 / np.asarray(self.limits.velocity), self.limits
         # Intervals narrower than the grid are rare; only where nothing else is left is the finer grid worth its time.
         for size in (ARM_ANGLES, 20 * ARM_ANGLES):
-            q, cost = _nearest(
+            q, cost = nearest_configuration(
                 circle.elbow, circle.rotations, own + _grid(size), 2.0 * math.pi / size, _every_branch(size),
                 q_reference, weight, self._middle, limits.position_lower, limits.position_upper,
             )  # fmt: skip
@@ -294,99 +281,9 @@ class SrsKinematics:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """`srs_chain.configurations` turned to the middle of the ranges, and whether each keeps the limits, (m, b)."""
         limits = self.limits
-        return _admissible(
+        return configurations_within(
             circle.elbow, circle.rotations, psi, branches, self._middle, limits.position_lower, limits.position_upper
         )
-
-
-@njit(cache=True, error_model="numpy")
-def _nearest(elbow, rotations, grid, step, branches, reference, weight, middle, lower, upper):
-    """The configuration (7,) nearest to a reference, and its distance squared; inf if none on the grid is admissible.
-
-    The best local minima of the grid are searched on ever finer grids about the best angle so far.
-    """
-    q, within = _admissible(elbow, rotations, grid, branches, middle, lower, upper)
-    cost = _weighted_squares(q, within, reference, weight)
-    count, columns = branches.shape
-    minima = np.full((count, columns), np.inf)
-    for m in range(count):
-        for k in range(columns):
-            if cost[m, k] <= cost[m - 1, k] and cost[m, k] <= cost[(m + 1) % count, k]:
-                minima[m, k] = cost[m, k]
-    best_q, best = np.empty(7), np.inf
-    offsets = np.linspace(-1.0, 1.0, 17)
-    branch = np.empty((offsets.size, 1), np.int64)
-    for flat in np.argsort(minima.ravel())[:_REFINED]:
-        m, k = flat // columns, flat % columns
-        if not np.isfinite(minima[m, k]):
-            break
-        width, angle, least, found = step, grid[m], cost[m, k], q[m, k].copy()
-        branch[:] = branches[m, k]
-        while width > 1e-9:
-            trial, within = _admissible(elbow, rotations, angle + width * offsets, branch, middle, lower, upper)
-            costs = _weighted_squares(trial, within, reference, weight)[:, 0]
-            pick = costs.argmin()
-            if costs[pick] < least:
-                least, angle, found = costs[pick], angle + width * offsets[pick], trial[pick, 0].copy()
-            # Wider than the spacing of 1/8: noise near the minimum cannot push it out of the next window.
-            width /= 6.0
-            # By then all that is left to gain is far below this.
-            if width < 1e-3 and least > 1.05 * best + 1e-9:
-                break
-        if least < best:
-            best, best_q = least, found
-    return best_q, best
-
-
-@njit(cache=True, error_model="numpy")
-def _follow(R, p, q_reference, lengths, nearest, farthest, middle, lower, upper, out):
-    """Write `SrsKinematics.follow`; whether there is such a configuration."""
-    elbow, rotations, L = circle_at(R, p, lengths, nearest, farthest)
-    if not (L >= ALIGNED and nearest - ROUNDING <= L <= farthest + ROUNDING):
-        return False
-    psi, branch = np.empty(1), np.empty((1, 1), np.int64)
-    psi[0] = arm_angle_of(q_reference, lengths[1], lengths[2])
-    branch[0, 0] = (q_reference[1] < 0.0) + 2 * (q_reference[3] < 0.0) + 4 * (q_reference[5] < 0.0)
-    q, within = _admissible(elbow, rotations, psi, branch, middle, lower, upper)
-    out[:] = q[0, 0]
-    return within[0, 0]
-
-
-@njit(cache=True, error_model="numpy")
-def _admissible(elbow, rotations, psi, branches, middle, lower, upper):
-    q = configurations(elbow, rotations, psi, branches)
-    return q, _turned_within(q, middle, lower, upper)
-
-
-@njit(cache=True, error_model="numpy")
-def _turned_within(q, middle, lower, upper):
-    """Turn joints (m, b, 7) by whole turns to the middle of their ranges, in place; whether all are in their ranges.
-
-    What is outside by rounding is put on the edge.
-    """
-    within = np.ones(q.shape[:2], dtype=np.bool_)
-    for m in range(q.shape[0]):
-        for k in range(q.shape[1]):
-            for i in range(7):
-                x = q[m, k, i] - 2.0 * np.pi * np.rint((q[m, k, i] - middle[i]) / (2.0 * np.pi))
-                edge = min(max(x, lower[i]), upper[i])
-                within[m, k] = within[m, k] and abs(x - edge) <= ROUNDING
-                q[m, k, i] = edge if abs(x - edge) <= ROUNDING else x
-    return within
-
-
-@njit(cache=True, error_model="numpy")
-def _weighted_squares(q, within, reference, weight):
-    """Σ ((q − reference) · weight)² of configurations (m, b, 7), inf where a limit is broken."""
-    cost = np.full(within.shape, np.inf)
-    for m in range(q.shape[0]):
-        for k in range(q.shape[1]):
-            if within[m, k]:
-                total = 0.0
-                for i in range(7):
-                    total += ((q[m, k, i] - reference[i]) * weight[i]) ** 2
-                cost[m, k] = total
-    return cost
 
 
 def _every_branch(count: int) -> NDArray[np.int64]:
