@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,16 +10,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from dyngrasp.closed_loop.record_file import RecordFormat
 from dyngrasp.control.velocity_filter import PAPER_TIME_CONSTANT, VelocityFilter
-from dyngrasp.errors import InputFileError
 from dyngrasp.signals import Array, Command, Observation
 from dyngrasp.simulation.plant import ContactCategory, Truth
 from dyngrasp.trajectory import PHASE_NAMES, PlanSample
 
-FORMAT, VERSION = "dyngrasp.record", 1
-
-# numpy keeps no text beside its arrays; this entry holds the names, as JSON.
-_HEADER = "header"
+FORMAT = RecordFormat("dyngrasp.record", 1, "a record of an episode")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,17 +101,8 @@ class EpisodeRecord:
 
     def save(self, path: str | Path) -> None:
         """Write everything into one compressed .npz file, exactly at `path`."""
-        header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "arm_joints": list(self.arm_joints),
-            "gripper_joints": list(self.gripper_joints),
-            "meta": self.meta,
-        }
-        arrays = {name: getattr(self, name) for name in ARRAY_NAMES}
-        # Through an open file, for numpy would append .npz to a name that lacks it.
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, **{_HEADER: np.array(json.dumps(header, allow_nan=False))}, **arrays)
+        header = {"arm_joints": self.arm_joints, "gripper_joints": self.gripper_joints, "meta": self.meta}
+        FORMAT.write(path, header, {name: getattr(self, name) for name in ARRAY_NAMES})
 
     @classmethod
     def load(cls, path: str | Path) -> EpisodeRecord:
@@ -125,18 +111,8 @@ class EpisodeRecord:
         Raises:
             InputFileError: The file is missing, is no record, or lacks an array.
         """
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                header = json.loads(str(archive[_HEADER]))
-                if header.get("format") != FORMAT or header.get("version") != VERSION:
-                    raise InputFileError(path, "format", header.get("format"), f"must be {FORMAT!r}, version {VERSION}")
-                arrays = {name: archive[name] for name in ARRAY_NAMES}
-        except OSError as error:
-            raise InputFileError(path, None, None, f"cannot be read: {error.strerror or error}") from error
-        except KeyError as error:
-            raise InputFileError(path, str(error.args[0]), None, "is missing from the record") from error
-        except (ValueError, AttributeError, zipfile.BadZipFile) as error:
-            raise InputFileError(path, None, None, f"is not a record of an episode: {error}") from error
+        with FORMAT.opened(path) as (header, archive):
+            arrays = {name: archive[name] for name in ARRAY_NAMES}
         return cls(tuple(header["arm_joints"]), tuple(header["gripper_joints"]), **arrays, meta=header["meta"])
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.errors import InputFileError
+from dyngrasp.closed_loop.record_file import RecordFormat
 from dyngrasp.models.camera import CameraModel
 from dyngrasp.perception.marker_detection import MarkerCorners
 from dyngrasp.perception.part_tracker import Frame, FrameReport
@@ -21,10 +19,7 @@ from dyngrasp.perception.pose_filter import Verdict
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.simulation.camera_sensor import Picture
 
-FORMAT, VERSION = "dyngrasp.vision", 1
-
-# numpy keeps no text beside its arrays; this entry holds the rest, as JSON.
-_HEADER = "header"
+FORMAT = RecordFormat("dyngrasp.vision", 1, "a record of a camera")
 
 ARRAY_NAMES = (
     "t_capture", "t_receipt", "arm_position", "ratio", "verdict",
@@ -65,9 +60,7 @@ class VisionRecord:
     def save(self, path: str | Path) -> None:
         """Write everything but the pictures into one compressed .npz file, exactly at `path`."""
         header = {
-            "format": FORMAT,
-            "version": VERSION,
-            "arm_joints": list(self.arm_joints),
+            "arm_joints": self.arm_joints,
             "camera": _camera_document(self.camera),
             "prior": None if self.prior is None else _prior_document(self.prior),
             "meta": self.meta,
@@ -87,10 +80,7 @@ class VisionRecord:
             np.array([marker.id for _, marker in seen], dtype=int),
             np.reshape([marker.corners for _, marker in seen], (len(seen), 4, 2)),
         )
-        arrays: dict[str, Any] = {name: np.asarray(c) for name, c in zip(ARRAY_NAMES, columns, strict=True)}
-        # Through an open file, for numpy would append .npz to a name that lacks it.
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, **{_HEADER: np.array(json.dumps(header, allow_nan=False))}, **arrays)
+        FORMAT.write(path, header, dict(zip(ARRAY_NAMES, map(np.asarray, columns), strict=True)))
 
     @classmethod
     def load(cls, path: str | Path) -> VisionRecord:
@@ -99,20 +89,10 @@ class VisionRecord:
         Raises:
             InputFileError: The file is missing, is no record of a camera, or lacks an array.
         """
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                header = json.loads(str(archive[_HEADER]))
-                if header.get("format") != FORMAT or header.get("version") != VERSION:
-                    raise InputFileError(path, "format", header.get("format"), f"must be {FORMAT!r}, version {VERSION}")
-                arrays = {name: archive[name] for name in ARRAY_NAMES}
+        with FORMAT.opened(path) as (header, archive):
+            arrays = {name: archive[name] for name in ARRAY_NAMES}
             prior = None if header["prior"] is None else _prior(header["prior"])
             names, camera, meta = tuple(header["arm_joints"]), _camera(header["camera"]), header["meta"]
-        except OSError as error:
-            raise InputFileError(path, None, None, f"cannot be read: {error.strerror or error}") from error
-        except KeyError as error:
-            raise InputFileError(path, str(error.args[0]), None, "is missing from the record") from error
-        except (ValueError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-            raise InputFileError(path, None, None, f"is not a record of a camera: {error}") from error
         return cls(names, camera, prior, _reports(arrays), meta=meta)
 
 
