@@ -1,0 +1,92 @@
+"""Worst values of a plan's samples against Pinocchio, called for one sample after the other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from dyngrasp.planning.audit import audit
+from dyngrasp.planning.plan_samples import SUBSTEPS
+
+from .failing_cases import PLANS, every_other, with_arm
+
+
+def busier_pad(wrench: pin.Force, task, grasp) -> float:
+    """Friction that the two pads need over what they have, by the statics of two contacts at y = ±w/2."""
+    friction, N = task.grasp_object.friction, task.settings.grip_share * task.gripper.pinch_force
+    arm = np.array([0.0, grasp.width / 2, 0.0])
+    shares = []
+    for side in (1, -1):
+        # Half of the force each, and the couple whose moment about x and z is the wrench's.
+        couple = np.cross(wrench.angular * [1, 0, 1], side * arm) / (2 * arm @ arm)
+        tangential = wrench.linear * [1, 0, 1] / 2 + couple
+        normal = N - side * wrench.linear[1] / 2
+        load = np.hypot(np.linalg.norm(tangential) / friction.sliding, wrench.angular[1] / 2 / friction.torsional)
+        shares.append(load / normal)
+    return max(shares)
+
+
+def one_sample_after_the_other(plan, targets, task, substeps: int) -> dict[str, float]:
+    """Worst values by Pinocchio, called for each sample by itself, on a grid `substeps` times as fine as the plan's."""
+    robots = (task.robot_empty, task.robot_empty, task.robot_loaded(targets.grasp))
+    torque, h, lateral, dip, angle, share = [], [], [], [], [], []
+    part, gripper, model = task.grasp_object, task.gripper, task.robot.pin_model
+    data, tip = model.createData(), task.robot.tip_id
+    T_flange_closed = gripper.T_flange_hand * gripper.T_hand_grasp(targets.gripper_closed)
+    part_in_grasp = targets.grasp.T_object_grasp.inverse().act(part.spatial_inertia)
+    for phase, (arm, fingers, robot) in enumerate(zip(plan.arm, plan.gripper, robots, strict=True)):
+        for t in np.linspace(0.0, arm.duration, substeps * arm.intervals + 1):
+            state, q_h = arm.sample(t), fingers.sample(t).position
+            q, w, v = state.position, state.velocity, state.acceleration
+            torque.append(np.abs(robot.inverse_dynamics(q, w, v) / robot.limits.torque).max())
+            hand = robot.forward_kinematics(q) * gripper.T_flange_hand * gripper.T_hand_grasp(q_h)
+            x, y, z = targets.T_world_grasp.actInv(hand.translation)
+            if phase == 0:
+                f = part.funnel
+                h.append(z - f.z_threshold * (1 - np.exp(-0.5 * ((x / f.sigma_x) ** 2 + (y / f.sigma_y) ** 2))))
+            elif phase == 1:
+                lateral.append(np.hypot(x, y))
+                dip.append(z)
+                angle.append(np.linalg.norm(pin.log3(targets.T_world_grasp.rotation.T @ hand.rotation)))
+            else:
+                pin.forwardKinematics(model, data, q, w, v)
+                pin.updateFramePlacement(model, data, tip)
+                velocity = T_flange_closed.actInv(pin.getFrameVelocity(model, data, tip, pin.LOCAL))
+                acceleration = T_flange_closed.actInv(pin.getFrameAcceleration(model, data, tip, pin.LOCAL))
+                upward = (data.oMf[tip] * T_flange_closed).rotation.T @ -model.gravity.linear
+                acceleration.linear = acceleration.linear + upward
+                wrench = part_in_grasp * acceleration + velocity.cross(part_in_grasp * velocity)
+                share.append(busier_pad(wrench, task, targets.grasp))
+    return {
+        "torque": max(torque),
+        "funnel": min(h),
+        "grasp_axis": max(lateral),
+        "grasp_dip": min(dip),
+        "grasp_tilt": max(angle),
+        "hold": max(share),
+    }
+
+
+def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, task):
+    report = audit(plan, targets, task)
+    for name, value in one_sample_after_the_other(plan, targets, task, 1).items():
+        # Rounding of kinematics and dynamics; the funnel's wall climbs up to 30 m per metre.
+        assert report[name].worst == pytest.approx(value, abs=1e-11), name
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("grasp_axis", "lateral_tolerance"), ("grasp_dip", "dip_tolerance"), ("grasp_tilt", "tilt_tolerance")],
+)
+def test_what_is_broken_between_two_grid_points_only_is_found(plan, targets, task, name, key):
+    """The hand goes aside half way through the grasp, between two points of a coarse grid; the limit lies between."""
+    aside = PLANS[name](plan, task)
+    coarse = with_arm(aside, *(every_other(phase, 20) for phase in aside.arm))
+    object.__setattr__(coarse, "gripper", tuple(every_other(phase, 20) for phase in aside.gripper))
+    grid, inside = (one_sample_after_the_other(coarse, targets, task, substeps)[name] for substeps in (1, SUBSTEPS))
+    assert abs(inside) > 1.1 * abs(grid), "no peak between the grid points"
+    strict = replace(task, settings=replace(task.settings, **{key: abs(grid + inside) / 2}))
+    entry = audit(coarse, targets, strict)[name]
+    assert not entry.ok
+    assert entry.worst == pytest.approx(inside, abs=1e-11)
