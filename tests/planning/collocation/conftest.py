@@ -5,6 +5,7 @@ import pytest
 
 from dyngrasp.models.catalogue import load_gripper, load_robot
 from dyngrasp.planning.collocation.ipopt import IpoptSolver
+from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.problem import PhaseProblem
 
 
@@ -22,6 +23,11 @@ def sdh2():
 def solver():
     """One for the session, as functions of a structure are built once."""
     return IpoptSolver()
+
+
+@pytest.fixture(scope="module")
+def structured():
+    return StructuredSolver()
 
 
 @pytest.fixture
