@@ -16,7 +16,8 @@ import pinocchio as pin
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.grasp_targets import GraspTask, grasp_targets
+from dyngrasp.planning.grasp_targets import grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 
 Q_START = np.deg2rad([55.0, 39.5, -6.6, -22.0, -36.3, 110.6, 134.0])
 PLACE = np.deg2rad([-45.0, 34.0, 0.0, -53.0, 0.0, 93.0, 90.0])

@@ -28,7 +28,8 @@ from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.residuals import excess, rows, worst_violation
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.grasp_targets import GraspTask, grasp_targets
+from dyngrasp.planning.grasp_targets import grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import PhaseProblem, Status
 from dyngrasp.signals import JointState
 from dyngrasp.trajectory import Trajectory

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from dyngrasp.planning.audit import audit as audit
     from dyngrasp.planning.collocation.planner import CollocationPlanner as CollocationPlanner
     from dyngrasp.planning.collocation.planner import CollocationSettings as CollocationSettings
-    from dyngrasp.planning.grasp_targets import GraspTask as GraspTask
-    from dyngrasp.planning.grasp_targets import TaskSettings as TaskSettings
     from dyngrasp.planning.grasp_targets import grasp_targets as grasp_targets
+    from dyngrasp.planning.grasp_task import GraspTask as GraspTask
+    from dyngrasp.planning.grasp_task import TaskSettings as TaskSettings
     from dyngrasp.planning.problem import Status as Status
     from dyngrasp.planning.replanning.replanner import Replanner as Replanner
     from dyngrasp.planning.replanning.target_update import updated_targets as updated_targets
@@ -35,8 +35,8 @@ _HOMES = {
     "audit": "dyngrasp.planning.audit",
     "CollocationPlanner": "dyngrasp.planning.collocation.planner",
     "CollocationSettings": "dyngrasp.planning.collocation.planner",
-    "GraspTask": "dyngrasp.planning.grasp_targets",
-    "TaskSettings": "dyngrasp.planning.grasp_targets",
+    "GraspTask": "dyngrasp.planning.grasp_task",
+    "TaskSettings": "dyngrasp.planning.grasp_task",
     "grasp_targets": "dyngrasp.planning.grasp_targets",
     "Replanner": "dyngrasp.planning.replanning.replanner",
     "Status": "dyngrasp.planning.problem",

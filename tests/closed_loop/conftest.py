@@ -11,7 +11,8 @@ from dyngrasp.closed_loop.episode import EpisodeSettings, grasp_controller, run_
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets
+from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.simulation.mujoco_plant import MujocoPlant
 from dyngrasp.simulation.scene import build_scene
 from dyngrasp.simulation.variation import PlantVariation

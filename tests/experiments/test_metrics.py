@@ -10,7 +10,7 @@ import pytest
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.experiments.metrics import judge
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
-from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.simulation.plant import ContactCategory
 from dyngrasp.trajectory import GraspPlan, Trajectory
 

@@ -6,7 +6,8 @@ import pytest
 
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.collocation.planner import CollocationPlanner
-from dyngrasp.planning.grasp_targets import GraspTask, grasp_targets
+from dyngrasp.planning.grasp_targets import grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 
 # Start and target of the experiments (deg).
 START = np.deg2rad([55, 39.5, -6.6, -22, -36.3, 110.6, 134])

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.robot import read_robot
-from dyngrasp.planning.grasp_targets import GraspTask, check_grasp, grasp_targets, ranked_grasp_targets
+from dyngrasp.planning.grasp_targets import check_grasp, grasp_targets, ranked_grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 
 # Positions over which the paper draws its objects (m), at any yaw.
 poses = st.tuples(st.floats(0.6, 0.7), st.floats(-0.1, 0.1), st.floats(-np.pi, np.pi))

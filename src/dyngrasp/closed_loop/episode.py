@@ -14,7 +14,7 @@ from dyngrasp.control.grasp_controller import Controller, GraspController
 from dyngrasp.control.gripper_control import GripperController, GripperControlSettings
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.grasp_object import Grasp
-from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.simulation.plant import Truth, TruthfulPlant
 from dyngrasp.trajectory import GraspPlan, PlanSample
 

@@ -20,7 +20,8 @@ from dyngrasp.planning import constraints
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.residuals import worst_violation
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets
+from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import PhaseProblem, PhaseSolver, Solution
 from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.signals import Array

@@ -17,7 +17,8 @@ from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.audit import audit
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
+from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.general_solvers import solver_of
 from dyngrasp.planning.replanning.lcqp import end_point_error, sparse_program
@@ -252,8 +253,7 @@ def _sequence(
 ) -> Iterator[tuple[ReplanResult, GraspPlan]]:
     """Replans from the start to the grasp, each from the plan of the one before; with the plan that ran before it."""
     plan, targets, T = cell.plan, cell.targets, cell.targets.T_world_object
-    twist = np.zeros(6)
-    heading = rng.uniform(-np.pi, np.pi)
+    twist, heading = np.zeros(6), rng.uniform(-np.pi, np.pi)
     direction = np.array([np.cos(heading), np.sin(heading), 0.0])
     if kind == "moving":
         twist[:3] = 0.03 * direction

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dyngrasp.closed_loop.record import EpisodeRecord
 from dyngrasp.models.grasp_object import Grasp
-from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.simulation.plant import ContactCategory
 from dyngrasp.trajectory import GraspPlan
 

@@ -18,7 +18,8 @@ from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.perception.pose_noise import PoseNoise, PoseNoiseSettings
 from dyngrasp.planning.collocation.planner import CollocationPlanner
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.grasp_targets import GraspTargets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.replanning.phase_programs import TrackingSettings
 from dyngrasp.planning.replanning.replanner import Replanner, ReplannerSettings
 from dyngrasp.trajectory import GraspPlan

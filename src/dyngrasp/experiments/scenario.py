@@ -20,7 +20,7 @@ from dyngrasp.experiments.scenario_values import (
     settings_schema,
 )
 from dyngrasp.models.model_file import Finite, NonNegative, StrictSchema, decode, read_toml
-from dyngrasp.planning.grasp_targets import TaskSettings
+from dyngrasp.planning.grasp_task import TaskSettings
 
 __all__ = [
     "CameraSection",

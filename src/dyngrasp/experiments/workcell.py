@@ -12,7 +12,7 @@ from dyngrasp.experiments.scenario import Scenario
 from dyngrasp.models.camera import CameraModel
 from dyngrasp.models.catalogue import load_camera, load_gripper, load_object, load_robot
 from dyngrasp.models.robot import RobotModel
-from dyngrasp.planning.grasp_targets import GraspTask
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.signals import Array, read_only
 
 

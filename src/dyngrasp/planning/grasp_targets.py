@@ -13,14 +13,12 @@ from numba import njit
 from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.models.inverse_kinematics import joint_velocity, null_space_velocity
-from dyngrasp.planning.grasp_task import GraspTask, TaskSettings
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.signals import Array, read_only
 
 __all__ = [
     "BoundaryState",
     "GraspTargets",
-    "GraspTask",
-    "TaskSettings",
     "check_grasp",
     "flange_poses",
     "grasp_targets",

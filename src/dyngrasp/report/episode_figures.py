@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dyngrasp.closed_loop.record import EpisodeRecord
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.grasp_targets import GraspTargets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.report.figures import MotionCurves, trajectory_figure
 from dyngrasp.trajectory import GraspPlan
 

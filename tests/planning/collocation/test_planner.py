@@ -13,7 +13,8 @@ from dyngrasp.planning.collocation.gripper_path import gripper_path
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.residuals import infeasible_at_once, worst_violation
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.grasp_targets import GraspTask, TaskSettings, grasp_targets
+from dyngrasp.planning.grasp_targets import grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask, TaskSettings
 from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.signals import JointState

@@ -90,7 +90,8 @@ from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning import collocation
 from dyngrasp.planning.collocation.planner import CollocationPlanner, CollocationSettings
 from dyngrasp.planning.collocation.structured import compile_kernels
-from dyngrasp.planning.grasp_targets import GraspTask, grasp_targets
+from dyngrasp.planning.grasp_targets import grasp_targets
+from dyngrasp.planning.grasp_task import GraspTask
 
 names = [module.name for module in pkgutil.iter_modules(collocation.__path__)]
 modules = [importlib.import_module(f"{collocation.__name__}.{name}") for name in names]

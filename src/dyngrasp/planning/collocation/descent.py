@@ -9,7 +9,8 @@ import pinocchio as pin
 
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.planning.collocation.closed_form import optimum_through
-from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.grasp_targets import GraspTargets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import PhaseProblem
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory

@@ -16,7 +16,8 @@ from dyngrasp.planning.collocation.closed_form import best_duration, within_spee
 from dyngrasp.planning.collocation.gripper_path import GripperPath, gripper_path
 from dyngrasp.planning.collocation.node_functions import node_functions
 from dyngrasp.planning.collocation.settings import CollocationSettings
-from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask
+from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import AuditReport, NodeConstraint, PhaseProblem
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import Trajectory

@@ -10,12 +10,13 @@ from dyngrasp.planning.audit import audit
 from dyngrasp.planning.collocation.descent import descent
 from dyngrasp.planning.collocation.phase_problems import PHASE_OF_RESERVE, HandMotion, PhaseProblems, Reserves
 from dyngrasp.planning.collocation.settings import BACKENDS, CollocationSettings
-from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask
+from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets
+from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import AuditReport, PhaseProblem, PhaseSolver, PlanResult, Solution, Status
 from dyngrasp.signals import Array, JointState
 from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, Trajectory
 
-__all__ = ["BACKENDS", "CollocationPlanner", "CollocationSettings"]
+__all__ = ["CollocationPlanner", "CollocationSettings"]
 
 # Plans after which raising the reserves is given up.
 MOST_PLANS = 8
