@@ -46,19 +46,18 @@ Degrees = Annotated[float, Field(ge=-360.0, le=360.0, allow_inf_nan=False)]
 Spread = Annotated[float, Field(ge=0.0, lt=1.0, allow_inf_nan=False)]
 
 
-def settings_schema(settings: type, *, leave_out: tuple[str, ...] = ()) -> type[StrictSchema]:
+def settings_schema(settings: type) -> type[StrictSchema]:
     """The strict schema of a settings dataclass: the same keys, units and defaults, every number finite and ≥ 0.
 
     Args:
         settings: A frozen dataclass whose fields are numbers, Booleans and strings with defaults.
-        leave_out: Fields that the scenario sets elsewhere.
     """
     kinds: dict[type, Any] = {float: NonNegative, int: Annotated[int, Field(ge=0)], bool: bool, str: str}
     fields: dict[str, Any] = {}
     for item in dataclasses.fields(settings):
-        # numpy scalars appear as defaults that were computed, such as deg2rad(1)
+        # Defaults that were computed, such as deg2rad(1), are numpy scalars.
         default: Any = item.default
         default = default.item() if hasattr(default, "item") else default
-        if item.name not in leave_out and type(default) in kinds:
+        if type(default) in kinds:
             fields[item.name] = (kinds[type(default)], default)
     return create_model(f"{settings.__name__}Section", __base__=StrictSchema, **fields)

@@ -192,8 +192,12 @@ def execute_trial(
         planner: States the problems that the replanner falls back on; one is made if it is needed and left out.
         source: Tells the replanner where the part is, in place of what the scenario's `[pose]` says.
         world: In which the first look was taken; a new one is made if there was none.
+
+    Raises:
+        PlanningFailed: The plan is not valid after all.
     """
     task, plan = workcell.task, planned.result.require()
+    start_time = plan.start_time
     meta = episode_meta(workcell, trial)
     with ExitStack() as stack:
         world = world or stack.enter_context(trial_world(workcell, trial, filmed=False))
@@ -217,7 +221,7 @@ def execute_trial(
     targets, events, not_taken = planned.targets, (), ()
     if loop is not None:
         plan, targets, events, not_taken = loop.newest, loop.targets, tuple(loop.events), tuple(loop.not_taken)
-    outcome = judge(plan, record, task, targets.grasp, planned.result.require().start_time)
+    outcome = judge(plan, record, task, targets.grasp, start_time)
     return ExecutedTrial(record, outcome, world.scene, plan, targets, events, not_taken, vision)
 
 

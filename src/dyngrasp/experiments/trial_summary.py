@@ -41,7 +41,7 @@ def summary(
     result = planned.result if planned else None
     return {
         "success": executed is not None and executed.outcome.success,
-        "cause": _cause(workcell, look, planned, executed),
+        "cause": _cause(workcell, planned, executed),
         "criteria": executed.outcome.summary() if executed else {},
         "replanning": replanning_summary(executed.replans, executed.not_taken) if executed else {},
         "first_look": _look_summary(workcell, look, vision),
@@ -104,9 +104,7 @@ def study_row(workcell: Workcell, trial: Trial, planner: CollocationPlanner) -> 
     return row
 
 
-def _cause(
-    workcell: Workcell, look: FirstLook | None, planned: PlannedTrial | None, executed: ExecutedTrial | None
-) -> str:
+def _cause(workcell: Workcell, planned: PlannedTrial | None, executed: ExecutedTrial | None) -> str:
     if executed is not None:
         return executed.outcome.cause
     if planned is not None:
@@ -158,6 +156,6 @@ def _drawn(workcell: Workcell, trial: Trial, look: FirstLook | None) -> dict[str
 
 
 def _error(workcell: Workcell, T_world_object: pin.SE3, T_believed: pin.SE3) -> pin.SE3:
-    """In the grasp frame: what the fingers feel."""
+    """What a believed pose is wrong by, in the grasp frame: what the fingers feel."""
     T_object_grasp = workcell.task.grasp_object.grasps[0].T_object_grasp
     return (T_world_object * T_object_grasp).actInv(T_believed * T_object_grasp)

@@ -183,11 +183,6 @@ class PoseFilter:
         """Whether there is a track, or a prior."""
         return self._track is not None
 
-    @property
-    def gate_limit(self) -> float:
-        """Largest squared Mahalanobis distance that passes."""
-        return self._limit
-
     def update(self, measured: PoseEstimate | Sequence[PoseEstimate], now: float | None = None) -> Verdict:
         """Take in one frame.
 

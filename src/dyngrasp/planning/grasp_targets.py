@@ -89,22 +89,6 @@ class GraspTargets:
             return self.T_world_object
         return moved(self.T_world_object, self.twist_world, t - self.grasp_time)
 
-    def part_poses(self, times: Array) -> tuple[Array, Array]:
-        """`T_world_object_at` for many times (M,): rotations (M, 3, 3) and positions (M, 3)."""
-        R, p = self.T_world_object.rotation, self.T_world_object.translation
-        if not self.moving:
-            return np.broadcast_to(R, (times.size, 3, 3)), np.broadcast_to(p, (times.size, 3))
-        dt = np.minimum(times - self.grasp_time, 0.0)
-        velocity, spin = self.twist_world[:3], pin.skew(self.twist_world[3:])
-        rate = float(np.linalg.norm(self.twist_world[3:]))
-        if rate > 0.0:
-            axis = spin / rate
-            angle = (rate * dt)[:, None, None]
-            turn = np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)
-        else:
-            turn = np.broadcast_to(np.eye(3), (times.size, 3, 3))
-        return turn @ R, p + dt[:, None] * velocity
-
 
 def moved(T_world_object: pin.SE3, twist_world: Array, dt: float) -> pin.SE3:
     """Where a body is after `dt` (s), before for dt < 0, with constant velocities of its origin and about it."""

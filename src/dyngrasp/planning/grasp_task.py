@@ -90,15 +90,15 @@ class GraspTask:
     @cached_property
     def robot_empty(self) -> RobotModel:
         """The arm with the open gripper as a rigid payload."""
-        return self._carrying_gripper(self.gripper.open_posture)
+        return self.robot.with_payload(self.gripper.payload(self.gripper.open_posture))
 
     def robot_loaded(self, grasp: Grasp) -> RobotModel:
         """The arm with the closed gripper and the part in `grasp` as rigid payloads."""
         if grasp not in self._loaded:
             closed = self.closed_posture(grasp)
             T_flange_object = self.T_flange_closed(grasp) * grasp.T_object_grasp.inverse()
-            loaded = self._carrying_gripper(closed).with_payload(T_flange_object.act(self.grasp_object.spatial_inertia))
-            self._loaded[grasp] = loaded
+            part = T_flange_object.act(self.grasp_object.spatial_inertia)
+            self._loaded[grasp] = self.robot.with_payload(self.gripper.payload(closed)).with_payload(part)
         return self._loaded[grasp]
 
     def pinch(self, grasp: Grasp) -> Pinch:
@@ -141,6 +141,3 @@ class GraspTask:
     @cached_property
     def _T_flange_closed(self) -> dict[float, pin.SE3]:
         return {}
-
-    def _carrying_gripper(self, posture: Array) -> RobotModel:
-        return self.robot.with_payload(self.gripper.T_flange_hand.act(self.gripper.inertia(posture)))

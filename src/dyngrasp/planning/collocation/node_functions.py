@@ -33,12 +33,10 @@ class NodeFunctions(Protocol):
 
     Attributes:
         rows: m.
-        compiled: Whether machine code evaluates them.
         depends_on_acceleration: (m,) whether a row depends on v at all.
     """
 
     rows: int
-    compiled: bool
     depends_on_acceleration: NDArray[np.bool_]
 
     def values(self, q: Array, v: Array, p: Array, g: Array, column: int) -> None:
@@ -119,8 +117,6 @@ def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, NDArr
 class InterpretedNodeFunctions:
     """CasADi's virtual machine, one call for the whole grid."""
 
-    compiled = False
-
     def __init__(self, function: ca.Function) -> None:
         self._values, self._derivatives, self.depends_on_acceleration = _expressions(function)
         self.rows = function.size1_out(0)
@@ -163,8 +159,6 @@ class CompiledNodeFunctions:
     Raises:
         CompilationError: There is no compiler, or it failed.
     """
-
-    compiled = True
 
     def __init__(self, function: ca.Function, name: str) -> None:
         values, derivatives, self.depends_on_acceleration = _expressions(function)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from dyngrasp.errors import InvalidProblem
-from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
-from dyngrasp.planning.collocation.structured import StructuredSettings, StructuredSolver
+from dyngrasp.planning.collocation.ipopt import IpoptSolver
+from dyngrasp.planning.collocation.structured import StructuredSolver
+from dyngrasp.planning.problem import PhaseSolver
 
-BACKENDS = {"structured": lambda: StructuredSolver(StructuredSettings()), "ipopt": lambda: IpoptSolver(IpoptSettings())}
+BACKENDS: dict[str, Callable[[], PhaseSolver]] = {"structured": StructuredSolver, "ipopt": IpoptSolver}
 """Solvers of one phase by name."""
 
 

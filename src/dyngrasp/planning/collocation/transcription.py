@@ -25,7 +25,6 @@ class NonlinearProgram:
     Attributes:
         problem: {"x", "p", "f", "g"} as CasADi wants it.
         grad_f, jac_g, hess_lag: Derivatives in the signatures of CasADi's IPOPT interface.
-        grid_rows: Number of rows of one grid point.
         functions: The constraint functions, kept alive because look-ups go by their identity.
     """
 
@@ -33,7 +32,6 @@ class NonlinearProgram:
     grad_f: ca.Function
     jac_g: ca.Function
     hess_lag: ca.Function
-    grid_rows: int
     functions: tuple[ca.Function, ...]
 
 
@@ -158,7 +156,6 @@ def build(problem: PhaseProblem) -> NonlinearProgram:
         ca.Function(
             "nlp_hess_l", [x, p, sigma, multiplier], [hess_lag], ["x", "p", "lam:f", "lam:g"], ["triu:hess:gamma:x:x"]
         ),
-        rows,
         tuple(constraint.function for constraint in problem.constraints),
     )
 
