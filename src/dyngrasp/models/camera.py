@@ -18,16 +18,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from dyngrasp.errors import ModelFileError
-from dyngrasp.models.model_file import (
-    Finite,
-    NonNegative,
-    Positive,
-    StrictSchema,
-    UnitQuaternion,
-    Vector3,
-    decode,
-    read_toml,
-)
+from dyngrasp.models.model_file import Finite, NonNegative, PoseTable, Positive, StrictSchema, decode, read_toml
 from dyngrasp.signals import Array, read_only
 
 # Newton's method from the distorted point; real lenses need four or five steps to rounding.
@@ -54,22 +45,15 @@ class IntrinsicsTable(StrictSchema):
     distortion: tuple[Finite, Finite, Finite, Finite, Finite]
 
 
-class MountTable(StrictSchema):
-    """`[mount]`: the camera frame in the hand frame."""
-
-    position: Vector3
-    quat_wxyz: UnitQuaternion
-
-
 class CameraFile(StrictSchema):
-    """A camera's model.toml."""
+    """A camera's model.toml. `mount` is the camera frame in the hand frame."""
 
     kind: Literal["camera"]
     name: str
     description: str = ""
     sensor: SensorTable
     intrinsics: IntrinsicsTable
-    mount: MountTable
+    mount: PoseTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +206,6 @@ def read_camera(path: str | Path) -> CameraModel:
     for key, centre, size in (("cx", intrinsics.cx, sensor.width), ("cy", intrinsics.cy, sensor.height)):
         if not 0.0 <= centre < size:
             raise ModelFileError(path, f"intrinsics.{key}", centre, f"a pixel of the picture, 0 to {size}")
-    w, x, y, z = table.mount.quat_wxyz
     camera = CameraModel(
         name=table.name,
         description=table.description,
@@ -231,7 +214,7 @@ def read_camera(path: str | Path) -> CameraModel:
         focal=np.array([intrinsics.fx, intrinsics.fy]),
         centre=np.array([intrinsics.cx, intrinsics.cy]),
         distortion=np.array(intrinsics.distortion),
-        T_hand_camera=pin.SE3(pin.Quaternion(w, x, y, z).normalized().matrix(), np.array(table.mount.position)),
+        T_hand_camera=table.mount.pose,
         rate=sensor.rate_hz,
         exposure=sensor.exposure_s,
     )

@@ -13,7 +13,7 @@ import pinocchio as pin
 import trimesh
 
 from dyngrasp.errors import ModelFileError
-from dyngrasp.models.model_file import Finite, Positive, StrictSchema, UnitQuaternion, Vector3, decode, read_toml
+from dyngrasp.models.model_file import Finite, PoseTable, Positive, StrictSchema, Vector3, decode, read_toml
 from dyngrasp.signals import Array, read_only
 
 # Families of markers by the names of the model file, and what OpenCV calls them.
@@ -33,12 +33,10 @@ CONVEX_SHARE = 1e-4
 UNDERSIDE_CORNERS = 8
 
 
-class GraspTable(StrictSchema):
+class GraspTable(PoseTable):
     """One `[[grasps]]` entry."""
 
     name: str
-    position: Vector3
-    quat_wxyz: UnitQuaternion
     width: Positive
 
 
@@ -57,13 +55,11 @@ class FrictionTable(StrictSchema):
     torsional: Positive
 
 
-class MarkerTable(StrictSchema):
+class MarkerTable(PoseTable):
     """One `[[markers]]` entry."""
 
     id: int
     size: Positive
-    position: Vector3
-    quat_wxyz: UnitQuaternion
 
 
 MarkerDictionary = Literal["4x4_50", "5x5_50", "6x6_50", "apriltag_36h11"]
@@ -239,17 +235,12 @@ def read_object(path: str | Path) -> GraspObject:
         mesh_path=path.parent / table.mesh,
         piece_paths=tuple(path.parent / name for name in table.pieces),
         rest_height=table.rest_height,
-        grasps=tuple(Grasp(g.name, _pose(g.position, g.quat_wxyz), g.width) for g in table.grasps),
+        grasps=tuple(Grasp(g.name, g.pose, g.width) for g in table.grasps),
         funnel=Funnel(table.funnel.z_threshold, table.funnel.sigma_x, table.funnel.sigma_y),
         friction=Friction(table.friction.sliding, table.friction.torsional),
-        markers=tuple(Marker(m.id, m.size, _pose(m.position, m.quat_wxyz)) for m in table.markers),
+        markers=tuple(Marker(m.id, m.size, m.pose) for m in table.markers),
         marker_dictionary=table.marker_dictionary,
     )
-
-
-def _pose(position: tuple[float, float, float], quat_wxyz: tuple[float, float, float, float]) -> pin.SE3:
-    w, x, y, z = quat_wxyz
-    return pin.SE3(pin.Quaternion(w, x, y, z).normalized().matrix(), np.array(position))
 
 
 def _inertia(table: InertiaTable, path: Path) -> Array:

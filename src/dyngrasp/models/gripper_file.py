@@ -12,16 +12,9 @@ from pydantic import Field
 from dyngrasp.errors import ModelFileError
 from dyngrasp.models.gripper import GripperModel
 from dyngrasp.models.kinematic_tree import frame_id, read_tree, require_in_range, require_length
-from dyngrasp.models.model_file import Finite, Positive, StrictSchema, UnitQuaternion, Vector3, decode, read_toml
+from dyngrasp.models.model_file import Finite, PoseTable, Positive, StrictSchema, Vector3, decode, read_toml
 
 ROUNDING = 1e-6  # rad and unitless: numbers written with six decimals agree to this
-
-
-class MountTable(StrictSchema):
-    """`[mount]`: pose of the hand frame in the robot's flange frame."""
-
-    position: Vector3
-    quat_wxyz: UnitQuaternion
 
 
 class PosturesTable(StrictSchema):
@@ -48,7 +41,7 @@ class PinchTable(StrictSchema):
 
 
 class GripperFile(StrictSchema):
-    """A gripper's model.toml."""
+    """A gripper's model.toml. `mount` is the hand frame in the robot's flange frame."""
 
     kind: Literal["gripper"]
     name: str
@@ -62,7 +55,7 @@ class GripperFile(StrictSchema):
     approach_axis: Vector3
     closing_axis: Vector3
     postures: PosturesTable
-    mount: MountTable
+    mount: PoseTable
     limits: GripperLimitsTable
     pinch: PinchTable
 
@@ -90,7 +83,6 @@ def read_gripper(path: str | Path) -> GripperModel:
     if abs(approach @ closing) > ROUNDING:
         raise ModelFileError(path, "closing_axis", closing.tolist(), "perpendicular to the approach axis")
     _check_pad_geoms(table, model, mjcf, path)
-    w, x, y, z = table.mount.quat_wxyz
     gripper = GripperModel(
         name=table.name,
         description=table.description,
@@ -100,7 +92,7 @@ def read_gripper(path: str | Path) -> GripperModel:
         velocity=np.deg2rad(table.limits.velocity_deg_per_s),
         acceleration=np.deg2rad(table.limits.acceleration_deg_per_s2),
         torque=np.array(table.limits.torque_nm),
-        T_flange_hand=pin.SE3(pin.Quaternion(w, x, y, z).normalized().matrix(), np.array(table.mount.position)),
+        T_flange_hand=table.mount.pose,
         approach_axis=approach,
         closing_axis=closing,
         open_posture=np.array(table.postures.open),

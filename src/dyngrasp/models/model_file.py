@@ -14,6 +14,8 @@ from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
+import numpy as np
+import pinocchio as pin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from dyngrasp.errors import ModelFileError
@@ -25,6 +27,7 @@ __all__ = [
     "Vector3",
     "UnitQuaternion",
     "StrictSchema",
+    "PoseTable",
     "read_toml",
     "decode",
 ]
@@ -56,6 +59,19 @@ class StrictSchema(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class PoseTable(StrictSchema):
+    """Where a frame is in another one: `position` (m) and `quat_wxyz`."""
+
+    position: Vector3
+    quat_wxyz: UnitQuaternion
+
+    @property
+    def pose(self) -> pin.SE3:
+        """The same with the rounding taken off the quaternion."""
+        w, x, y, z = self.quat_wxyz
+        return pin.SE3(pin.Quaternion(w, x, y, z).normalized().matrix(), np.array(self.position))
 
 
 SchemaT = TypeVar("SchemaT", bound=BaseModel)
