@@ -64,7 +64,7 @@ class FlangeChain:
 
 @njit(cache=True, error_model="numpy")
 def place_frames(rotations, offsets, q, frames):
-    """Write the frames [R | p] (n+1, 3, 4) of all joints and of the flange in the world."""
+    """Write the frames [R | p] (n+1, 3, 4) of all joints and of the flange in the world, at q (n,) (rad)."""
     for i in range(offsets.shape[0]):
         if i == 0:
             frames[0, :, :3], frames[0, :, 3] = rotations[0], offsets[0]

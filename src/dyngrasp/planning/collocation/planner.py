@@ -49,16 +49,19 @@ class CollocationPlanner:
     ) -> PlanResult:
         """Plan the three phases one after the other, and audit the whole.
 
+        A moving part is met when and where the targets say: then the durations of approach and grasp are given.
+
         Args:
             q_start: (n,) configuration at rest (rad), or a state with its velocity.
             targets: Boundary states of the phases.
             gripper_start: (m,) present posture of the gripper (rad), at rest; open if left out.
             start_time: Time of the first grid point on the common clock (s).
 
-        A moving part is met when and where the targets say: then the durations of approach and grasp are given.
-
         Returns:
             The plan if every phase converged and the audit passed; else what went wrong, as a status.
+
+        Raises:
+            InvalidProblem: The hand cannot close in time, or a moving part cannot be met when the targets say.
         """
         began = time.perf_counter()
         start, hand = _state(q_start), self._problems.hand(targets, gripper_start)
