@@ -245,6 +245,9 @@ def late_move_rows(cell: Cell, count: int, seed: int) -> list[dict[str, Any]]:
 
 def _case_of(result: ReplanResult) -> str:
     free = result.path is Path.TRACKING and result.iterations == 0 and not result.message
+    if "fresh" in result.timings_ms:
+        # A budget of its own: the running plan bridges it.
+        return "cycle_fresh"
     return "cycle_free" if free else "cycle_constrained"
 
 

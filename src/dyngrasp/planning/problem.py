@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple, Protocol
@@ -287,6 +288,8 @@ class PlanResult:
 class PhaseSolver(Protocol):
     """A backend: solves one phase. Expected failures are statuses, never exceptions."""
 
-    def solve(self, problem: PhaseProblem, guess: Trajectory | None = None) -> Solution:
-        """Solve `problem`, from `guess` if given (any number of grid points, any duration)."""
+    def solve(
+        self, problem: PhaseProblem, guess: Trajectory | None = None, stop: Callable[[], bool] | None = None
+    ) -> Solution:
+        """Solve `problem`, from `guess` if given (any number of grid points, any duration), until `stop` says so."""
         ...

@@ -129,9 +129,9 @@ class CountingSolver:
     def __init__(self):
         self.solver, self.asked = StructuredSolver(), []
 
-    def solve(self, problem, guess=None):
+    def solve(self, problem, guess=None, stop=None):
         self.asked.append(problem)
-        return self.solver.solve(problem, guess)
+        return self.solver.solve(problem, guess, stop)
 
 
 @pytest.mark.parametrize(

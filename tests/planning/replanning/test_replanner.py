@@ -144,9 +144,9 @@ def test_a_slow_solver_is_late(task, plan, targets):
     now = [0.0]
 
     class Slow(StructuredSolver):
-        def solve(self, problem, guess=None):
+        def solve(self, problem, guess=None, stop=None):
             now[0] += 0.05
-            return super().solve(problem, guess)
+            return super().solve(problem, guess, stop)
 
     class WithoutGuess(CollocationPlanner):
         def guess(self, problem, targets):

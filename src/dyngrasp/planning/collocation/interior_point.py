@@ -22,7 +22,7 @@ the unit of the objective whatever the grid.
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -76,7 +76,7 @@ class InteriorPoint:
         model: PhaseModel,
         x: Array,
         T: float,
-        deadline: float = np.inf,
+        stop: Callable[[], bool] | None = None,
         barrier: float = 1e-3,
         cautious: bool = False,
     ) -> tuple[Outcome, Best, int]:
@@ -86,7 +86,7 @@ class InteriorPoint:
             model: The problem.
             x: Start, unknowns of `ThreeTap`.
             T: Start, duration (s).
-            deadline: A value of `time.perf_counter`; the best iterate until then is returned.
+            stop: Asked at every iteration; once it says yes the best iterate until then is returned.
             barrier: μ at the start, relative to the objective.
             cautious: Whether to begin in monotone mode, so that the start is not left far behind.
 
@@ -133,7 +133,7 @@ class InteriorPoint:
                 return Outcome.OPTIMAL, self.best, iteration
             if iteration == settings.max_iterations:
                 break
-            if time.perf_counter() > deadline:
+            if stop is not None and stop():
                 return Outcome.DEADLINE, self.best, iteration
             if not feasible and self._violation_stays(violation, error, iteration):
                 if model.factor == 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,12 +63,15 @@ class IpoptSolver:
         self.settings = settings or IpoptSettings()
         self._solvers: dict[tuple, tuple[transcription.NonlinearProgram, ca.Function]] = {}
 
-    def solve(self, problem: PhaseProblem, guess: Trajectory | None = None) -> Solution:
+    def solve(
+        self, problem: PhaseProblem, guess: Trajectory | None = None, stop: Callable[[], bool] | None = None
+    ) -> Solution:
         """Solve one phase.
 
         Args:
             problem: What is asked.
             guess: Where to start; without it, the optimum of the problem without its inequalities.
+            stop: Asked once, before IPOPT begins; after that its own time limit holds.
 
         Returns:
             The solution. Failures are statuses; a trajectory is given even then, if there is a finite one, and it
@@ -76,6 +80,8 @@ class IpoptSolver:
         clock = time.perf_counter
         began = clock()
         reason = infeasible_at_once(problem, self.settings.violation_tolerance)
+        if not reason and stop is not None and stop():
+            reason = "no time left"
         if reason:
             timings = {"total": 1e3 * (clock() - began)}
             return Solution(Status.INFEASIBLE, None, np.nan, 0, np.inf, timings, f"{problem.name}: {reason}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -85,12 +86,15 @@ class StructuredSolver:
         self.settings = settings or StructuredSettings()
         self._methods: dict[tuple, tuple[WorkArrays, InteriorPoint]] = {}
 
-    def solve(self, problem: PhaseProblem, guess: Trajectory | None = None) -> Solution:
+    def solve(
+        self, problem: PhaseProblem, guess: Trajectory | None = None, stop: Callable[[], bool] | None = None
+    ) -> Solution:
         """Solve one phase.
 
         Args:
             problem: What is asked.
             guess: Where to start if limits are active: a motion of any duration on any grid, as the rest of a plan.
+            stop: Asked at every iteration; once it says yes the best iterate is returned, as at the time limit.
 
         Returns:
             The solution. Failures are statuses; a trajectory is given even then, if there is a finite one, and it
@@ -101,9 +105,15 @@ class StructuredSolver:
         with np.errstate(all="ignore"):
             functions = [node_functions(constraint) for constraint in problem.constraints]
             compile_kernels()
-            return self._solve(problem, functions, guess)
+            return self._solve(problem, functions, guess, stop)
 
-    def _solve(self, problem: PhaseProblem, functions: list[NodeFunctions], guess: Trajectory | None) -> Solution:
+    def _solve(
+        self,
+        problem: PhaseProblem,
+        functions: list[NodeFunctions],
+        guess: Trajectory | None,
+        stop: Callable[[], bool] | None,
+    ) -> Solution:
         began = time.perf_counter()
         settings = self.settings
         limits = LimitRows.of(problem, functions)
@@ -131,7 +141,11 @@ class StructuredSolver:
 
         start = closed_form.within_speed_limits(problem, T) if guess is None else on_grid(problem, guess)
         deadline = began + settings.time_limit
-        narrow = self._solve_window(model, g, start, deadline, guess is not None)
+
+        def late() -> bool:
+            return time.perf_counter() > deadline or (stop is not None and stop())
+
+        narrow = self._solve_window(model, g, start, late, guess is not None)
         if narrow is not None:
             trajectory, iterations = narrow
             objective = model.values(model.map.unknowns(trajectory), trajectory.duration, g)
@@ -143,10 +157,10 @@ class StructuredSolver:
         x, T = model.map.unknowns(start), start.duration
         # A guess stands on the right side of walls: where they bend, full steps would leave it.
         cautious = guess is not None and model.bend(x, T) > BENT
-        outcome, best, iterations = method.solve(model, x, T, deadline, settings.initial_barrier, cautious)
+        outcome, best, iterations = method.solve(model, x, T, late, settings.initial_barrier, cautious)
         if outcome in _UNSOLVED:
             # One in a thousand problems must keep farther from its limits at first; the others are faster so.
-            outcome, best, iterations = method.solve(model, x, T, deadline, settings.second_barrier, cautious)
+            outcome, best, iterations = method.solve(model, x, T, late, settings.second_barrier, cautious)
         timings["solve"] = 1e3 * (time.perf_counter() - prepared)
         curvature = model.map.expand(best.x, best.T)[CURVATURE]
         if not (np.isfinite(curvature).all() and np.isfinite(best.T) and best.T > 0 and np.isfinite(best.objective)):
@@ -161,7 +175,7 @@ class StructuredSolver:
         return Solution(_STATUS[outcome], trajectory, objective, iterations, violation, timings, message)
 
     def _solve_window(
-        self, model: PhaseModel, g: Array, start: Trajectory, deadline: float, cautious: bool
+        self, model: PhaseModel, g: Array, start: Trajectory, stop: Callable[[], bool], cautious: bool
     ) -> tuple[Trajectory, int] | None:
         """The optimum under those constraints alone that g violates, late and by its positions; None if that is not so.
 
@@ -185,9 +199,7 @@ class StructuredSolver:
         work, method = self._kept(window.map.first.size, problem.joints, inside)
         part = PhaseModel(problem, functions, inside, work, window)
         x = window.unknowns(model.map.unknowns(start))
-        outcome, best, iterations = method.solve(
-            part, x, start.duration, deadline, self.settings.window_barrier, cautious
-        )
+        outcome, best, iterations = method.solve(part, x, start.duration, stop, self.settings.window_barrier, cautious)
         if outcome is not Outcome.OPTIMAL:
             return None
         curvature = window.curvature(problem, best.x, best.T)

@@ -43,6 +43,7 @@ class Attempt:
         self.recovery: FunnelRecovery | None = None
         self.reasons: list[str] = []
         self.iterations = 0
+        self.audit_took = 0.0
         self.previous: GraspTargets | None = None
         self.splice = splice_time(plan, t + self.settings.budget)
         self.state = plan.sample(self.splice)
@@ -181,7 +182,7 @@ class Attempt:
         return standstill(self.plan, self.task, self.splice).ok
 
     def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
-        started = time.perf_counter()
+        started, started_clock = time.perf_counter(), self.clock()
         if self.recovery is None:
             report = audit(plan, targets, self.task, self.splice)
         else:
@@ -189,6 +190,7 @@ class Attempt:
         if self._keeps_moving:
             report = AuditReport((*report.entries, standstill(plan, self.task, self.splice)))
         self._count("audit", started)
+        self.audit_took = self.clock() - started_clock
         return report
 
     def _reoptimised(self, candidate: GraspPlan, targets: GraspTargets) -> tuple[GraspPlan | None, Path]:
@@ -242,7 +244,7 @@ class Attempt:
             elif refused <= solved:
                 break
             started = time.perf_counter()
-            improved, why = self.full.improve(plan, refused, problems, state, targets, lambda: self._late(budget))
+            improved, why = self.full.improve(plan, refused, problems, state, targets, self._stop(budget))
             self._count("full", started)
             if improved is None:
                 break
@@ -282,7 +284,7 @@ class Attempt:
         if recovery is not None:
             problems, why = self.full.problems(state, left, targets, recovery)
             if problems is not None:
-                fresh, why = self.full.fresh(plan, splice, problems, state, targets)
+                fresh, why = self.full.fresh(plan, splice, problems, state, targets, self._stop(budget))
         self._count("fresh", started)
         if fresh is None:
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {why}")
@@ -315,6 +317,10 @@ class Attempt:
 
     def _late(self, budget: float) -> bool:
         return self.clock() - self.began > budget
+
+    def _stop(self, budget: float) -> Callable[[], bool]:
+        """When a solver has to give up: what it finds still has to be audited, which takes as long as the last time."""
+        return lambda: self._late(budget - self.audit_took)
 
     def _count(self, stage: str, started: float) -> None:
         self.timings[stage] = self.timings.get(stage, 0.0) + 1e3 * (time.perf_counter() - started)

@@ -107,14 +107,14 @@ class FullProblem:
         problems: tuple[PhaseProblem, ...],
         state: PlanSample,
         targets: GraspTargets,
-        late: Callable[[], bool],
+        stop: Callable[[], bool],
     ) -> tuple[GraspPlan | None, str]:
-        """The plan with some phases solved anew, from what they are in it; None and why if one of them fails."""
+        """The plan with some phases solved anew, from what they are in it; None and why if one of them fails.
+
+        The solver gives up once `stop` says so.
+        """
         for phase in sorted(phases):
-            solution = self.solver.solve(problems[phase], plan.arm[phase])
-            if not solution.ok and phase == APPROACH and not late():
-                # The old motion leads into the wall where the hand has to rise first: come down the funnel anew.
-                solution = self._from_above(problems[phase], targets, solution)
+            solution = self.solver.solve(problems[phase], plan.arm[phase], stop)
             motion, why = self._joined(solution, phase, state, targets)
             if motion is None:
                 return None, why
@@ -130,11 +130,12 @@ class FullProblem:
         problems: tuple[PhaseProblem, ...],
         state: PlanSample,
         targets: GraspTargets,
+        stop: Callable[[], bool],
     ) -> tuple[GraspPlan | None, str]:
         """A plan from the splice on that owes nothing to the running one but its state and the paths of its hand."""
         motions: list[Trajectory] = []
         for phase, problem in enumerate(problems):
-            solution = self.solver.solve(problem, self.planner.guess(problem, targets))
+            solution = self.solver.solve(problem, self.planner.guess(problem, targets), stop)
             motion, why = self._joined(solution, phase, state, targets)
             if motion is None:
                 return None, why
@@ -143,10 +144,6 @@ class FullProblem:
         waiting = Trajectory(motions[APPROACH].duration, still + state.gripper.position, still, still)
         closing = (stretched(path, arm.duration) for path, arm in zip(running.gripper[1:], motions[1:], strict=True))
         return replace(running, arm=tuple(motions), gripper=(waiting, *closing), start_time=splice), ""
-
-    def _from_above(self, problem: PhaseProblem, targets: GraspTargets, failed: Solution) -> Solution:
-        guess = self.planner.guess(problem, targets)
-        return failed if guess is None else self.solver.solve(problem, guess)
 
     def _joined(
         self, solution: Solution, phase: int, state: PlanSample, targets: GraspTargets
