@@ -31,7 +31,9 @@ def test_refuses_other_files(delivered, tmp_path):
     np.savez(stranger, t=np.zeros(3))
     pickled = tmp_path / "pickled.npz"
     np.savez(pickled, header=np.array([{"format": "dyngrasp.record"}], dtype=object))
-    for path in (missing, text, stranger, pickled):
+    array = tmp_path / "array.npy"
+    np.save(array, np.zeros(3))
+    for path in (missing, text, stranger, pickled, array):
         with pytest.raises(InputFileError, match=path.name):
             EpisodeRecord.load(path)
 
