@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyngrasp.errors import GraspRefused, OutOfReach
+from dyngrasp.errors import GraspRefused, InvalidProblem, OutOfReach
 from dyngrasp.models.robot import read_robot
 from dyngrasp.planning.grasp_targets import check_grasp, grasp_targets, ranked_grasp_targets
-from dyngrasp.planning.grasp_task import GraspTask
+from dyngrasp.planning.grasp_task import GraspTask, TaskSettings
 
 # Positions over which the paper draws its objects (m), at any yaw.
 poses = st.tuples(st.floats(0.6, 0.7), st.floats(-0.1, 0.1), st.floats(-np.pi, np.pi))
@@ -252,3 +252,18 @@ def test_loads_follow_from_hand_and_part(task):
         own = task.gripper.payload(closed)
         lever = (own.mass * own.lever + task.grasp_object.mass * com) / loaded.payload.mass
         np.testing.assert_allclose(loaded.payload.lever, lever, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"lift_speed": -0.01},
+        {"approach_speed": np.nan},
+        {"pregrasp_distance": 0.0},
+        {"grip_share": 1.2},
+        {"grasp_duration_min": 0.9, "grasp_duration_max": 0.8},
+    ],
+)
+def test_senseless_settings_are_refused(bad):
+    with pytest.raises(InvalidProblem, match=next(iter(bad))):
+        TaskSettings(**bad)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, create_model
+from pydantic import AfterValidator, BeforeValidator, Field, create_model, model_validator
 
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.model_file import Finite, NonNegative, StrictSchema
 
 
@@ -50,7 +51,8 @@ def settings_schema(settings: type) -> type[StrictSchema]:
     """The strict schema of a settings dataclass: the same keys, units and defaults, every number finite and ≥ 0.
 
     Args:
-        settings: A frozen dataclass whose fields are numbers, Booleans and strings with defaults.
+        settings: A frozen dataclass whose fields are numbers, Booleans and strings with defaults. What it refuses
+            itself, the schema refuses too.
     """
     kinds: dict[type, Any] = {float: NonNegative, int: Annotated[int, Field(ge=0)], bool: bool, str: str}
     fields: dict[str, Any] = {}
@@ -60,4 +62,13 @@ def settings_schema(settings: type) -> type[StrictSchema]:
         default = default.item() if hasattr(default, "item") else default
         if type(default) in kinds:
             fields[item.name] = (kinds[type(default)], default)
-    return create_model(f"{settings.__name__}Section", __base__=StrictSchema, **fields)
+
+    def accepted(section: StrictSchema) -> StrictSchema:
+        try:
+            settings(**section.model_dump())
+        except InvalidProblem as error:
+            raise ValueError(f"settings that make sense: {error}") from error
+        return section
+
+    validators: dict[str, Any] = {"accepted": model_validator(mode="after")(accepted)}
+    return create_model(f"{settings.__name__}Section", __base__=StrictSchema, __validators__=validators, **fields)

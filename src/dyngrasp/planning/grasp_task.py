@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
+from dyngrasp.errors import InvalidProblem
 from dyngrasp.models.grasp_object import Grasp, GraspObject
 from dyngrasp.models.gripper import GripperModel
 from dyngrasp.models.inverse_kinematics import InverseKinematics, inverse_kinematics_for
@@ -15,10 +16,22 @@ from dyngrasp.models.pinch import Pinch
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.signals import Array, read_only
 
+# Without these there is no approach, no pinch, or no room at all to move in.
+_POSITIVE = (
+    "pregrasp_distance",
+    "grasp_duration_min",
+    "grip_share",
+    "lateral_tolerance",
+    "dip_tolerance",
+    "tilt_tolerance",
+)
+
 
 @dataclass(frozen=True)
 class TaskSettings:
     """How a part is approached, pinched and lifted.
+
+    All numbers are finite and ≥ 0.
 
     Attributes:
         pregrasp_distance: Height of G above the grasp frame where the approach ends (m; the paper draws about 20 mm).
@@ -59,6 +72,20 @@ class TaskSettings:
     tilt_tolerance: float = np.deg2rad(1.0)
     limit_margin: float = np.deg2rad(5.0)
     dexterity_min: float = 0.04
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (np.isfinite(value) and (value > 0 or (value == 0 and item.name not in _POSITIVE))):
+                bound = "> 0" if item.name in _POSITIVE else "≥ 0"
+                raise InvalidProblem(f"{item.name} must be a number {bound}, got {value}")
+        if self.grip_share > 1:
+            raise InvalidProblem(f"grip_share must be at most 1, got {self.grip_share}")
+        if self.grasp_duration_min > self.grasp_duration_max:
+            raise InvalidProblem(
+                f"grasp_duration_min must be at most grasp_duration_max, got {self.grasp_duration_min} s and "
+                f"{self.grasp_duration_max} s"
+            )
 
 
 @dataclass(frozen=True, eq=False)

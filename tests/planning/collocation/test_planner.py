@@ -169,7 +169,19 @@ def test_a_hand_too_slow_for_the_grasp_is_refused_in_numbers(iiwa, sdh2, task, t
         CollocationPlanner(quick).phase_problems(Q_START, targets)
 
 
-@pytest.mark.parametrize("bad", [{"torque_fraction": 0.0}, {"velocity_fraction": 1.1}, {"backend": "none"}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"torque_fraction": 0.0},
+        {"velocity_fraction": 1.1},
+        {"backend": "none"},
+        {"intervals": 3},
+        {"effort_weight": -1.0},
+        {"hold_safety": 0.9},
+        {"funnel_margin": np.nan},
+        {"max_duration": np.inf},
+    ],
+)
 def test_senseless_settings_are_refused(bad):
     with pytest.raises(InvalidProblem, match=next(iter(bad))):
         CollocationSettings(**bad)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from dyngrasp.errors import InvalidProblem
 from dyngrasp.planning.collocation.ipopt import IpoptSolver
 from dyngrasp.planning.collocation.structured import StructuredSolver
-from dyngrasp.planning.problem import PhaseSolver
+from dyngrasp.planning.problem import MIN_INTERVALS, PhaseSolver
 
 BACKENDS: dict[str, Callable[[], PhaseSolver]] = {"structured": StructuredSolver, "ipopt": IpoptSolver}
 """Solvers of one phase by name."""
@@ -46,5 +48,17 @@ class CollocationSettings:
         for name in ("velocity_fraction", "torque_fraction"):
             if not 0 < getattr(self, name) <= 1:
                 raise InvalidProblem(f"{name} must be in (0, 1], got {getattr(self, name)}")
+        if self.intervals < MIN_INTERVALS:
+            raise InvalidProblem(f"intervals must be at least {MIN_INTERVALS}, got {self.intervals}")
+        for name, least in (
+            ("effort_weight", 0.0),
+            ("position_margin", 0.0),
+            ("funnel_margin", 0.0),
+            ("hold_safety", 1.0),
+        ):
+            if not least <= getattr(self, name) < np.inf:
+                raise InvalidProblem(f"{name} must be a number ≥ {least:g}, got {getattr(self, name)}")
+        if not 0 < self.max_duration < np.inf:
+            raise InvalidProblem(f"max_duration must be a number of seconds > 0, got {self.max_duration}")
         if self.backend not in BACKENDS:
             raise InvalidProblem(f"no backend called {self.backend!r}; valid: {', '.join(sorted(BACKENDS))}")
