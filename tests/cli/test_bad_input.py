@@ -57,7 +57,7 @@ def test_an_unknown_key_lists_the_valid_ones(refused, tmp_path):
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("task.settings.grip_share=1.5", ["task.settings", "grip_share", "at most 1", "1.5"]),
+        ("task.settings.grip_share=1.5", ("task.settings", "grip_share", "at most 1", "1.5")),
         ("part.x=0.6", ("part.x", "x_m", "yaw_deg")),
         ("nonsense", ("key=value",)),
         ("part.x_m=650", ("part.x_m", "650", "metres")),
