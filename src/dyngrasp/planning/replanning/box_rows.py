@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.joint_splines import Indices
+from dyngrasp.planning.replanning.joint_splines import TAPS, Indices
 from dyngrasp.signals import Array
 
 # Beyond this a bound is none (rad, rad/s, rad/s²): nothing that moves in a cell comes near it.
@@ -90,3 +90,50 @@ def collect(
                             codes[count] = ((kind * 2 + side) * K + k) * n + j
                             count += 1
     return count, least
+
+
+@njit(cache=True, error_model="numpy")
+def impose(
+    codes: Indices,
+    begin: int,
+    end: int,
+    n: int,
+    K: int,
+    T: float,
+    T_lin: float,
+    z: Array,
+    slope: Array,
+    boxes: Array,
+    rates: Array,
+    first: Indices,
+    taps: Array,
+    at: Indices,
+    along: Array,
+    cs: Array,
+    g: Array,
+) -> None:
+    """Decode some rows, and write their values g, their derivatives cs by T, and those by the unknowns."""
+    for i in range(begin, end):
+        j = codes[i] % n
+        k = (codes[i] // n) % K
+        kind = codes[i] // (n * K * 2)
+        sign = 1.0 - 2.0 * ((codes[i] // (n * K)) % 2)
+        b, c, scale = bound(kind, k, j, sign, T_lin, boxes, rates)
+        at[i] = first[k] * n + j
+        for tap in range(TAPS):
+            along[i, tap] = -scale * sign * taps[k, tap, kind]
+        cs[i] = (c - sign * slope[kind, k, j]) * scale
+        g[i] = (b + c * (T - T_lin) - sign * z[kind, k, j]) * scale
+
+
+@njit(cache=True, error_model="numpy")
+def scatter(
+    y: Array, factor: float, begin: int, end: int, n: int, at: Indices, along: Array, cs: Array, out: Array
+) -> float:
+    """Add a multiple of Gᵀ y, of some rows, to out ((N−1) n,); return the part of T without that factor."""
+    by_T = 0.0
+    for i in range(begin, end):
+        by_T += y[i] * cs[i]
+        for b in range(TAPS):
+            out[at[i] + b * n] += factor * y[i] * along[i, b]
+    return by_T

@@ -9,16 +9,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.box_rows import bound, collect
+from dyngrasp.planning.replanning.active_set import finish, newton_matrix
+from dyngrasp.planning.replanning.box_rows import collect, impose, scatter
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
     Indices,
     factorise,
     product,
-    pull_back,
     push_forward,
     substitute,
-    weigh,
+    substitute_both,
+    subtract,
 )
 from dyngrasp.signals import Array
 
@@ -26,7 +27,15 @@ OPTIMAL, INFEASIBLE, ITERATION_LIMIT, NONFINITE = 0, 1, 2, 3
 
 # Rows are looked for when the complementarity, over the cost, first falls below this and each time it has fallen by as
 # much again; those closer to their bound than this are taken up, with slacks no smaller than that.
-LOOK_BELOW, LOOK_NEAR = 0.3, 1e-2
+LOOK_BELOW, LOOK_NEAR = 0.03, 1e-2
+
+# The end is tried when the complementarity, over the cost, first falls below this and all rows are met as well as this,
+# and each time it has fallen to a tenth. Rows are thought to be active whose multiplier, over the cost, is more than
+# this share of their slack.
+FINISH_BELOW, FINISH_NEAR, FINISH_SHARE = 1e-5, 1e-2, 1.0
+
+# Guesses at most, and the penalty in units of the cost over the square of the violation that it is the price of.
+FINISH_ROUNDS, PENALTY = 10, 1e8
 
 
 @njit(cache=True, error_model="numpy")
@@ -37,13 +46,10 @@ def interior_point(
     first: Indices,
     taps: Array,
     base: Array,
-    weights: Array,
-    node_weights: Array,
+    base_column: Array,
+    corner: float,
+    g_T: float,
     slope: Array,
-    by_T: Array,
-    stiffness_T: float,
-    error: Array,
-    gradient_T: float,
     dx: Array,
     T: float,
     T_lin: float,
@@ -52,8 +58,8 @@ def interior_point(
     rates: Array,
     duration: tuple[float, float],
     free_T: bool,
-    ends_cost: bool,
     unit: float,
+    violation: float,
     max_iterations: int,
     multipliers: Array,
 ) -> tuple[int, float, int, int]:
@@ -65,14 +71,11 @@ def interior_point(
         a_ends: See `collect`.
         first: Of `filters`.
         taps: Of `filters`.
-        base: (N−1, 3) band of the Hessian of the cost, the same for every joint.
-        weights: (3,) weights of q, w, a in the cost.
-        node_weights: (K,) added to the weight of q at each grid point.
+        base: (N−1, 3, n) bands of the Hessian of the cost.
+        base_column: (N−1, n) derivatives of its gradient by T.
+        corner: Second derivative of the cost by T.
+        g_T: First derivative of the cost by T at the start; that by the unknowns is zero there.
         slope: (3, K, n) how q, w, a change with T at constant x.
-        by_T: (3, K, n) how the errors change with T.
-        stiffness_T: Second derivative of the cost's own term in T.
-        error: (3, K, n) errors at the start.
-        gradient_T: First derivative of the cost's own term in T at the start.
         dx: (N−1, n), added to: the steps taken.
         T: At the start (s).
         T_lin: Where the rows are linear (s).
@@ -81,8 +84,8 @@ def interior_point(
         rates: See `bound`.
         duration: Bounds of T (s).
         free_T: Whether T is a variable.
-        ends_cost: Whether the cost counts both end points.
         unit: Typical size of the cost.
+        violation: Largest violation of a row at the start, > 0.
         max_iterations: Of the method.
         multipliers: Written: λ of each row, those of T last.
 
@@ -98,42 +101,34 @@ def interior_point(
     imposed, found = np.zeros(all_rows, np.bool_), np.empty(all_rows, np.int64)
     for i in range(rows):
         imposed[codes[i]] = True
-    _impose(codes, 0, rows, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
+    impose(codes, 0, rows, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
     shortest, longest = duration
-    limited_T = free_T and longest < np.inf
     cs[rows], cs[rows + 1] = 1.0 / longest, -1.0 / longest
     g[rows], g[rows + 1] = (T - shortest) / longest, (longest - T) / longest
+    at[rows : rows + 2], along[rows : rows + 2] = 0, 0.0
 
-    used = rows + 2 if limited_T else rows
-    least = 0.0
-    for i in range(used):
-        least = min(least, g[i])
-    floor = max(-least, 1e-2)
-    s, lam, omega, target = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    used = rows + 2 if free_T else rows
+    floor = max(violation, 1e-2)
+    s, lam, omega = np.empty(m), np.empty(m), np.empty(m)
     # Divisions are the dearest of what is done for a row.
-    per_s, per_lam = np.empty(m), np.empty(m)
-    ds, dlam, dg = np.zeros(m), np.zeros(m), np.zeros(m)
+    per_s = np.empty(m)
+    ds, dlam = np.empty(m), np.empty(m)
+    active = np.empty(m, np.bool_)
     mu = 0.1 * unit / max(used, 1)
     for i in range(used):
         s[i] = max(g[i], floor)
         lam[i] = mu / s[i]
     band, column, solved = np.empty((size, 3, n)), np.empty((size, n)), np.empty((size, n))
-    gradient, step, dual = np.empty((size, n)), np.empty((size, n)), np.empty_like(z)
-    flat_band, flat_column, flat_step = band.ravel(), column.ravel(), step.ravel()
+    step, step_T = np.empty((size, n)), 0.0
+    # ∇f − Gᵀ λ: each step takes its length of what is left.
+    residual = np.zeros((size, n))
+    residual_T = g_T - scatter(lam, -1.0, 0, used, n, at, along, cs, residual.ravel())
+    flat_step = step.ravel()
     # Steps that z has not followed yet: it is asked for only when rows are looked for.
     ahead, ahead_T = np.zeros((size, n)), 0.0
-    k_first, k_last = (0, K) if ends_cost else (1, K - 1)
-    weigh(by_T, weights, node_weights, k_first, k_last, dual)
-    corner = stiffness_T + product(dual, by_T)
-    pull_back(taps, dual, column)
-    base_column = column.copy()
-    # The cost is quadratic: its gradient follows from the steps.
-    weigh(error, weights, node_weights, k_first, k_last, dual)
-    g_T = gradient_T + product(dual, by_T)
-    pull_back(taps, dual, gradient)
     outcome = ITERATION_LIMIT
     iterations = 0
-    look_below = LOOK_BELOW
+    look_below, finish_below = LOOK_BELOW, FINISH_BELOW
     for iteration in range(max_iterations + 1):
         iterations = iteration
         mean, primal = 0.0, 0.0
@@ -154,17 +149,51 @@ def interior_point(
                     new += 1
             if new > rows:
                 # The rows of T stay the last.
-                for array in (s, lam, g, cs, ds, dlam, dg):
+                for array in (s, lam, g, cs):
                     array[new], array[new + 1] = array[rows], array[rows + 1]
-                _impose(codes, rows, new, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
+                at[new : new + 2], along[new : new + 2] = 0, 0.0
+                impose(codes, rows, new, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
                 for i in range(rows, new):
                     s[i] = max(g[i], LOOK_NEAR)
                     lam[i] = mean / s[i]
                     primal = max(primal, abs(g[i] - s[i]))
+                residual_T -= scatter(lam, -1.0, rows, new, n, at, along, cs, residual.ravel())
                 used += new - rows
                 rows = new
-        if not np.isfinite(mean + primal + g_T):
+        if not np.isfinite(mean + primal + residual_T):
             return NONFINITE, T, iteration, rows
+        if mean * used <= finish_below * unit and primal <= FINISH_NEAR:
+            finish_below *= 0.1
+            for i in range(used):
+                active[i] = lam[i] > FINISH_SHARE * unit * s[i]
+            found_all, step_T = finish(
+                FINISH_ROUNDS,
+                PENALTY * unit / violation**2,
+                used,
+                at,
+                along,
+                cs,
+                g,
+                lam,
+                active,
+                residual,
+                residual_T,
+                base,
+                base_column,
+                corner,
+                free_T,
+                band,
+                column,
+                solved,
+                step,
+                omega,
+            )
+            if found_all:
+                T += step_T
+                ahead_T += step_T
+                subtract(-1.0, step, ahead)
+                outcome = OPTIMAL
+                break
         if mean * used <= 1e-12 * unit and primal <= 1e-11:
             outcome = OPTIMAL
             break
@@ -173,68 +202,41 @@ def interior_point(
             break
         if iteration == max_iterations:
             break
-        # Newton matrix.
-        for i in range(size):
-            for d in range(3):
-                band[i, d, :] = base[i, d]
-        column[:] = base_column
-        c_T = corner
         for i in range(used):
-            per_s[i], per_lam[i] = 1.0 / s[i], 1.0 / lam[i]
+            per_s[i] = 1.0 / s[i]
             omega[i] = lam[i] * per_s[i]
-            c_T += omega[i] * cs[i] * cs[i]
-            if i < rows:
-                # The same place in an array of three numbers an unknown: (f, 0, j) instead of (f, j).
-                in_band = 3 * at[i] - 2 * (at[i] % n)
-                for b in range(TAPS):
-                    weight = omega[i] * along[i, b]
-                    flat_column[at[i] + b * n] += cs[i] * weight
-                    for d in range(TAPS - b):
-                        flat_band[in_band + (3 * b + d) * n] += weight * along[i, b + d]
+        complement = newton_matrix(omega, used, at, along, cs, base, base_column, corner, band, column)
         factorise(band)
-        if free_T:
-            solved[:] = column
-            substitute(band, solved)
-            complement = c_T
-            for i in range(size):
-                for j in range(n):
-                    complement -= column[i, j] * solved[i, j]
-        else:
-            complement = 1.0
         sigma_mu = 0.0
         for corrected in range(2):
             # Right-hand side: −∇f + Gᵀ((σμ − Δs Δλ)/s − ω (g − s)), for Δs = GΔ + g − s, Δλ = … .
             for i in range(used):
-                second = ds[i] * dlam[i] if corrected == 1 else 0.0
-                target[i] = (sigma_mu - second) * per_s[i] - omega[i] * (g[i] - s[i])
-            step[:] = -gradient
-            r_T = -g_T + _scatter(target, rows, used, n, at, along, cs, flat_step)
-            dT = 0.0
+                second = sigma_mu - ds[i] * dlam[i] if corrected == 1 else 0.0
+                dlam[i] = second * per_s[i] - omega[i] * (g[i] - s[i]) - lam[i]
+            step[:] = 0.0
+            subtract(1.0, residual, step)
+            step_T = -residual_T + scatter(dlam, 1.0, 0, used, n, at, along, cs, flat_step)
+            if corrected == 0 and free_T:
+                solved[:] = column
+                substitute_both(band, solved, step)
+                complement -= product(column, solved)
+            else:
+                substitute(band, step)
             if free_T:
-                dT = r_T
-                for i in range(size):
-                    for j in range(n):
-                        dT -= solved[i, j] * step[i, j]
-                dT /= complement
-            substitute(band, step)
-            if free_T:
-                for i in range(size):
-                    for j in range(n):
-                        step[i, j] -= dT * solved[i, j]
-            for i in range(used):
-                dg[i] = cs[i] * dT
-                if i < rows:
-                    for b in range(TAPS):
-                        dg[i] += along[i, b] * flat_step[at[i] + b * n]
+                step_T = (step_T - product(column, step)) / complement
+                subtract(step_T, solved, step)
+            else:
+                step_T = 0.0
             keep = 1.0 if corrected == 0 else 0.995
             shrink_primal, shrink_dual = keep, keep
             for i in range(used):
-                second = ds[i] * dlam[i] if corrected == 1 else 0.0
-                ds_i = dg[i] + g[i] - s[i]
-                dlam_i = (sigma_mu - second) * per_s[i] - lam[i] - omega[i] * ds_i
-                ds[i], dlam[i] = ds_i, dlam_i
-                shrink_primal = max(shrink_primal, -ds_i * per_s[i])
-                shrink_dual = max(shrink_dual, -dlam_i * per_lam[i])
+                change = cs[i] * step_T
+                for b in range(TAPS):
+                    change += along[i, b] * flat_step[at[i] + b * n]
+                ds[i] = change + g[i] - s[i]
+                dlam[i] -= omega[i] * change
+                shrink_primal = max(shrink_primal, -ds[i] * per_s[i])
+                shrink_dual = max(shrink_dual, -dlam[i] / lam[i])
             step_primal, step_dual = keep / shrink_primal, keep / shrink_dual
             if corrected == 0:
                 after = 0.0
@@ -245,28 +247,17 @@ def interior_point(
         # One step length for both keeps the gradient's share of the rows consistent in a quadratic program.
         length = min(step_primal, step_dual)
         for i in range(used):
+            # Δg = Δs − (g − s)
+            g[i] += length * (ds[i] - g[i] + s[i])
             s[i] += length * ds[i]
             lam[i] += length * dlam[i]
-            g[i] += length * dg[i]
-        T += length * dT
-        ahead_T += length * dT
-        g_T += length * corner * dT
-        for i in range(size):
-            for j in range(n):
-                move = length * step[i, j]
-                ahead[i, j] += move
-                g_T += base_column[i, j] * move
-                gradient[i, j] += base[i, 0] * move + length * dT * base_column[i, j]
-            if i + 1 < size:
-                for j in range(n):
-                    gradient[i, j] += base[i, 1] * length * step[i + 1, j]
-                    gradient[i + 1, j] += base[i, 1] * length * step[i, j]
-            if i + 2 < size:
-                for j in range(n):
-                    gradient[i, j] += base[i, 2] * length * step[i + 2, j]
-                    gradient[i + 2, j] += base[i, 2] * length * step[i, j]
+        T += length * step_T
+        ahead_T += length * step_T
+        subtract(-length, step, ahead)
+        residual *= 1.0 - length
+        residual_T *= 1.0 - length
     _follow(taps, slope, ahead, ahead_T, dx, z)
-    multipliers[:] = 0.0
+    multipliers[rows : rows + 2] = 0.0
     multipliers[:used] = lam[:used]
     return outcome, T, iterations, rows
 
@@ -278,49 +269,3 @@ def _follow(taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, 
     z += ahead_T * slope
     dx += ahead
     ahead[:] = 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _impose(
-    codes: Indices,
-    begin: int,
-    end: int,
-    n: int,
-    K: int,
-    T: float,
-    T_lin: float,
-    z: Array,
-    slope: Array,
-    boxes: Array,
-    rates: Array,
-    first: Indices,
-    taps: Array,
-    at: Indices,
-    along: Array,
-    cs: Array,
-    g: Array,
-) -> None:
-    """Decode some rows, and write their values g, their derivatives cs by T, and those by the unknowns."""
-    for i in range(begin, end):
-        j = codes[i] % n
-        k = (codes[i] // n) % K
-        kind = codes[i] // (n * K * 2)
-        sign = 1.0 - 2.0 * ((codes[i] // (n * K)) % 2)
-        b, c, scale = bound(kind, k, j, sign, T_lin, boxes, rates)
-        at[i] = first[k] * n + j
-        for tap in range(TAPS):
-            along[i, tap] = -scale * sign * taps[k, tap, kind]
-        cs[i] = (c - sign * slope[kind, k, j]) * scale
-        g[i] = (b + c * (T - T_lin) - sign * z[kind, k, j]) * scale
-
-
-@njit(cache=True, error_model="numpy")
-def _scatter(y: Array, rows: int, used: int, n: int, at: Indices, along: Array, cs: Array, out: Array) -> float:
-    """Add Gᵀ y to out ((N−1) n,); return the part of T."""
-    by_T = 0.0
-    for i in range(used):
-        by_T += y[i] * cs[i]
-        if i < rows:
-            for b in range(TAPS):
-                out[at[i] + b * n] += y[i] * along[i, b]
-    return by_T

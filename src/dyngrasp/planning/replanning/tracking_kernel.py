@@ -23,7 +23,6 @@ from dyngrasp.planning.replanning.joint_splines import (
     sequence,
     spread_weights,
     substitute_shared,
-    weigh,
 )
 from dyngrasp.signals import Array
 
@@ -134,7 +133,7 @@ def solve(
     for end in range(2):
         for j in range(n):
             moving_ends = moving_ends or (held[end] and ends[end, 2, j] != 0.0)
-    T_lin, dT, gradient_T = T, 0.0, 0.0
+    T_lin, dT, g_T, corner = T, 0.0, 0.0, 0.0
     # A given acceleration enters as T² q̈: the program is solved twice, the second time about the T of the first.
     passes = 2 if moving_ends and free_T and not paper_rows else 1
     for _ in range(passes):
@@ -143,8 +142,7 @@ def solve(
         sequence(x, values, held, r)
         # The sequence is linear: at constant x it changes with T as it would from slopes at the ends and x = 0.
         sequence(nothing, slopes, held, r_by_T)
-        gradient_T, corner = stiffness_T * (T - T_ref), stiffness_T
-        g_T = gradient_T
+        g_T, corner = stiffness_T * (T - T_ref), stiffness_T
         gradient[:], column[:] = 0.0, 0.0
         for kind in range(3):
             if scaled[kind] > 0.0 or (kind == POSITION and some_node):
@@ -166,7 +164,7 @@ def solve(
             gradient += dT * solved
         x -= gradient
         T += dT
-        gradient_T += stiffness_T * dT
+        g_T += corner * dT - product(column, gradient)
     # The last step with the row of T² linear, as the program has it.
     values += dT * slopes
     sequence(x, values, held, r)
@@ -179,37 +177,36 @@ def solve(
         T_lin = T_ref
     a_ends = (not held[0], not held[1])
     iterations, outcome, count = 0, OPTIMAL, 0
-    codes, multipliers = np.empty(0, np.int64), np.zeros(2)
-    _, least = collect(z, T, T_lin, boxes, rates, -np.inf, a_ends, codes)
+    codes = np.empty(12 * K * n, np.int64)
+    multipliers = np.empty(codes.size + 2)
+    near, least = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
+    multipliers[:2] = 0.0
     if least < -VIOLATION:
-        codes = np.empty(12 * K * n, np.int64)
-        multipliers = np.empty(codes.size + 2)
-        count, _ = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
-        slope, error, by_T, duals = np.empty_like(z), np.empty_like(z), np.empty_like(z), np.zeros_like(z)
+        count = near
+        slope, bands_of_all = np.empty_like(z), np.empty((size, 3, n))
         filtered(r_by_T, slope)
-        _errors(reference, T, T_ref, z, slope, error, by_T)
-        weigh(error, scaled, node_weights, k_first, k_last, duals)
-        cost = 0.5 * (stiffness_T * (T - T_ref) ** 2 + product(duals, error))
+        for i in range(size):
+            for d in range(3):
+                bands_of_all[i, d] = base[i, d]
         # The cost of moving by what is violated is the scale of a program whose free optimum costs next to nothing.
-        unit = max(cost, 0.5 * (stiffness_T + n * scaled[0]) * least * least, 1e-9)
-        x_free, z_free, error_free = x.copy(), z.copy(), error.copy()
-        T_free, gradient_free = T, gradient_T
+        cost = _cost(reference, T, T_ref, z, scaled, node_weights, k_first, k_last)
+        cost += 0.5 * stiffness_T * (T - T_ref) ** 2
+        violation = -least
+        unit = max(cost, 0.5 * (stiffness_T + n * scaled[0]) * violation**2, 1e-9)
+        x_free, z_free, T_free = x.copy(), z.copy(), T
         for attempt in range(3):
-            x[:], z[:], error[:], T = x_free, z_free, error_free, T_free
+            x[:], z[:], T = x_free, z_free, T_free
             outcome, T, steps, count = interior_point(
                 codes,
                 count,
                 a_ends,
                 first,
                 taps,
-                base,
-                scaled,
-                node_weights,
+                bands_of_all,
+                column,
+                corner,
+                g_T,
                 slope,
-                by_T,
-                stiffness_T,
-                error,
-                gradient_free,
                 x,
                 T,
                 T_lin,
@@ -218,8 +215,8 @@ def solve(
                 rates,
                 duration,
                 free_T,
-                ends_cost,
                 unit,
+                violation,
                 max_iterations,
                 multipliers,
             )
@@ -285,13 +282,20 @@ def _duals(
     return by_T, by_TT
 
 
-@njit(cache=True, error_model="numpy")
-def _errors(reference: Motion, T: float, T_ref: float, z: Array, slope: Array, error: Array, by_T: Array) -> None:
-    """Write the deviations of q, w, a (3, N+1, n) and their derivatives by T."""
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _cost(
+    reference: Motion, T: float, T_ref: float, z: Array, scaled: Array, node_weights: Array, k_first: int, k_last: int
+) -> float:
+    """What the deviations of q, w, a (3, N+1, n) cost."""
+    total = 0.0
+    n = z.shape[2]
     for kind in range(3):
-        factor, factor_by_T = _of_reference(kind, T, T_ref)
-        error[kind] = z[kind] - factor * reference[kind]
-        by_T[kind] = slope[kind] - factor_by_T * reference[kind]
+        factor, _ = _of_reference(kind, T, T_ref)
+        for k in range(k_first, k_last):
+            weight = scaled[kind] + (node_weights[k] if kind == POSITION else 0.0)
+            for j in range(n):
+                total += weight * (z[kind, k, j] - factor * reference[kind][k, j]) ** 2
+    return 0.5 * total
 
 
 @njit(cache=True, error_model="numpy")
