@@ -23,6 +23,7 @@ from dyngrasp.planning.replanning.joint_splines import (
     substitute,
     substitute_both,
     subtract,
+    write,
 )
 from dyngrasp.signals import Array
 
@@ -53,8 +54,8 @@ def newton_matrix(
     Rows and the derivatives of the cost are those of `interior_point`.
     """
     _, n = column.shape
-    band[:] = base
-    column[:] = base_column
+    write(1.0, base, band)
+    write(1.0, base_column, column)
     flat_band, flat_column = band.ravel(), column.ravel()
     for i in range(used):
         if omega[i] > 0.0:
@@ -130,8 +131,7 @@ def finish(
         factorise(band)
         worst, changed = 0.0, False
         for polish in range(_POLISHES):
-            step[:] = 0.0
-            subtract(1.0, residual, step)
+            write(-1.0, residual, step)
             step_T = -residual_T
             for i in range(used):
                 y = new[i] - lam[i] - omega[i] * g[i]
@@ -139,7 +139,7 @@ def finish(
                 for b in range(TAPS):
                     flat_step[at[i] + b * n] += y * along[i, b]
             if polish == 0 and free_T:
-                solved[:] = column
+                write(1.0, column, solved)
                 substitute_both(band, solved, step)
                 complement -= product(column, solved)
             else:

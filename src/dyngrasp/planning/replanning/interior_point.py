@@ -20,6 +20,7 @@ from dyngrasp.planning.replanning.joint_splines import (
     substitute,
     substitute_both,
     subtract,
+    write,
 )
 from dyngrasp.signals import Array
 
@@ -111,7 +112,7 @@ def interior_point(
     floor = max(violation, 1e-2)
     s, lam, omega = np.empty(m), np.empty(m), np.empty(m)
     # Divisions are the dearest of what is done for a row.
-    per_s = np.empty(m)
+    per_s, per_lam = np.empty(m), np.empty(m)
     ds, dlam = np.empty(m), np.empty(m)
     active = np.empty(m, np.bool_)
     mu = 0.1 * unit / max(used, 1)
@@ -203,7 +204,7 @@ def interior_point(
         if iteration == max_iterations:
             break
         for i in range(used):
-            per_s[i] = 1.0 / s[i]
+            per_s[i], per_lam[i] = 1.0 / s[i], 1.0 / lam[i]
             omega[i] = lam[i] * per_s[i]
         complement = newton_matrix(omega, used, at, along, cs, base, base_column, corner, band, column)
         factorise(band)
@@ -213,11 +214,10 @@ def interior_point(
             for i in range(used):
                 second = sigma_mu - ds[i] * dlam[i] if corrected == 1 else 0.0
                 dlam[i] = second * per_s[i] - omega[i] * (g[i] - s[i]) - lam[i]
-            step[:] = 0.0
-            subtract(1.0, residual, step)
+            write(-1.0, residual, step)
             step_T = -residual_T + scatter(dlam, 1.0, 0, used, n, at, along, cs, flat_step)
             if corrected == 0 and free_T:
-                solved[:] = column
+                write(1.0, column, solved)
                 substitute_both(band, solved, step)
                 complement -= product(column, solved)
             else:
@@ -236,7 +236,7 @@ def interior_point(
                 ds[i] = change + g[i] - s[i]
                 dlam[i] -= omega[i] * change
                 shrink_primal = max(shrink_primal, -ds[i] * per_s[i])
-                shrink_dual = max(shrink_dual, -dlam[i] / lam[i])
+                shrink_dual = max(shrink_dual, -dlam[i] * per_lam[i])
             step_primal, step_dual = keep / shrink_primal, keep / shrink_dual
             if corrected == 0:
                 after = 0.0
@@ -254,7 +254,7 @@ def interior_point(
         T += length * step_T
         ahead_T += length * step_T
         subtract(-length, step, ahead)
-        residual *= 1.0 - length
+        write(1.0 - length, residual, residual)
         residual_T *= 1.0 - length
     _follow(taps, slope, ahead, ahead_T, dx, z)
     multipliers[rows : rows + 2] = 0.0
@@ -266,6 +266,6 @@ def interior_point(
 def _follow(taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, z: Array) -> None:
     """Add steps (N−1, n) of the unknowns, and one of T, to dx and z; the former are zero afterwards."""
     push_forward(taps, ahead, z)
-    z += ahead_T * slope
-    dx += ahead
+    subtract(-ahead_T, slope, z)
+    subtract(-1.0, ahead, dx)
     ahead[:] = 0.0

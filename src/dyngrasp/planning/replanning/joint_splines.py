@@ -314,6 +314,14 @@ def substitute_shared(band: Array, x: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
+def write(factor: float, a: Array, out: Array) -> None:
+    """Write a multiple of an array of the same shape; flat, for an assignment of arrays is no vector loop."""
+    x, y = a.ravel(), out.ravel()
+    for i in range(x.size):
+        y[i] = factor * x[i]
+
+
+@njit(cache=True, error_model="numpy")
 def subtract(factor: float, a: Array, out: Array) -> None:
     """Subtract a multiple of an array from another."""
     x, y = a.ravel(), out.ravel()
