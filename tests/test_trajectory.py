@@ -95,7 +95,9 @@ def test_what_nobody_can_write_to_is_shared():
     trajectory = Trajectory(1.0, *block)
     assert np.shares_memory(trajectory.position, block)
     # other numbers and other layouts are none of its own
-    assert Trajectory(1.0, *frozen(np.zeros((3, 5, 2), np.float32))).position.dtype == float
+    single = np.zeros((3, 5, 2), np.float32)
+    single.setflags(write=False)
+    assert Trajectory(1.0, *single).position.dtype == float  # type: ignore[arg-type]
     assert Trajectory(1.0, *frozen(np.zeros((3, 2, 5))).transpose(0, 2, 1)).position.flags.c_contiguous
 
 

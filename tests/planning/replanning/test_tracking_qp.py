@@ -134,11 +134,11 @@ def kkt_residuals(p, solution):
     N, n = reference.intervals, reference.position.shape[1]
     ends = np.stack([p.start, p.end])
     held = (p.hold_start_acceleration, p.hold_end_acceleration)
-    motion_array = np.stack([reference.position, reference.velocity, reference.acceleration])
+    motion = (reference.position, reference.velocity, reference.acceleration)
 
     def scaled(x, T):
         values, slopes = np.empty((2, 3, n)), np.empty((2, 3, n))
-        boundary(T, T_ref, ends, motion_array, False, values, slopes)
+        boundary(T, T_ref, ends, motion, False, values, slopes)
         r, z = np.empty((N + 3, n)), np.empty((3, N + 1, n))
         sequence(x, values, held, r)
         filtered(r, z)
