@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from dyngrasp.errors import OutOfReach
 from dyngrasp.experiments.bench_plan import PLACE_DEG, START_DEG
+from dyngrasp.experiments.end_point_errors import end_point_rows
 from dyngrasp.experiments.statistics import timing_summary
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.audit import audit
@@ -21,10 +22,10 @@ from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.general_solvers import solver_of
-from dyngrasp.planning.replanning.lcqp import end_point_error, sparse_program
-from dyngrasp.planning.replanning.phase_programs import APPROACH, TrackingSettings
+from dyngrasp.planning.replanning.lcqp import sparse_program
+from dyngrasp.planning.replanning.phase_programs import APPROACH
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
-from dyngrasp.planning.replanning.splice import rest_of, track
+from dyngrasp.planning.replanning.splice import rest_of
 from dyngrasp.planning.replanning.target_update import updated_targets
 from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingWeights, paper_step, solve_tracking
 from dyngrasp.signals import PoseEstimate
@@ -103,7 +104,7 @@ def bench_replan(
     late = late_move_rows(cell, max(cycles // 100, 4), seed)
     rows += [*_cycle_rows(cell, cycles, seed, progress), *late]
     progress("end point errors of the two updates")
-    rows += end_point_rows(cell, seed)
+    rows += end_point_rows(cell.plan, cell.targets, cell.task, seed)
     return [row | {"rho": effort_weight} for row in rows]
 
 
@@ -294,57 +295,6 @@ def splice_jump(running: GraspPlan, result: ReplanResult) -> float:
         for part in ("arm", "gripper")
         for name in ("position", "velocity", "acceleration")
     )
-
-
-def end_point_rows(cell: Cell, seed: int) -> list[dict[str, Any]]:
-    """How far the hand would miss the pre-grasp if the accelerations of the updated plan were carried out."""
-    rows: list[dict[str, Any]] = []
-    for stiffness in (1.0, 100.0):
-        weights = TrackingWeights(0.01, 0.01, 1.0, stiffness)
-        for solver in ("lcqp", "exact"):
-            settings = TrackingSettings(weights=weights, paper_rows=solver == "lcqp")
-            for centimetres in (1, 3, 5, 10):
-                error = _miss(cell, settings, [0.01 * centimetres], 0.3, seed)
-                rows.append(_error_row(solver, stiffness, f"{centimetres} cm", error))
-            error = _miss(cell, settings, [0.01] * 20, 0.02, seed)
-            rows.append(_error_row(solver, stiffness, "20 x 1 cm", error))
-    return rows
-
-
-def _error_row(solver: str, stiffness: float, move: str, error: float) -> dict[str, Any]:
-    return {
-        "solver": solver,
-        "case": "end_point_error",
-        "duration_weight": stiffness,
-        "move": move,
-        "error_mm": 1e3 * error,
-    }
-
-
-def _miss(cell: Cell, settings: TrackingSettings, steps: list[float], share: float, seed: int) -> float:
-    """Median over eight headings of the miss after a series of moves (m); a series walks at random."""
-    misses = []
-    for i in range(8):
-        rng = np.random.default_rng([seed, i])
-        plan, targets = cell.plan, cell.targets
-        heading = 2 * np.pi * i / 8
-        for step in steps:
-            direction = np.array([np.cos(heading), np.sin(heading), 0.0])
-            T = targets.T_world_object
-            try:
-                targets = updated_targets(targets, pin.SE3(T.rotation, T.translation + step * direction), cell.task)
-            except OutOfReach:
-                break
-            candidate = track(
-                plan, targets, cell.task, plan.start_time + share * cell.plan.durations[APPROACH], settings
-            )
-            if candidate.plan is None:
-                break
-            plan = candidate.plan
-            heading += rng.uniform(-np.pi / 2, np.pi / 2)
-        else:
-            misses.append(end_point_error(plan.arm[APPROACH], cell.task.robot))
-    return float(np.median(misses)) if misses else float("nan")
 
 
 def _displaced(T: pin.SE3, rng: np.random.Generator, distance: float, degrees: float) -> pin.SE3:
