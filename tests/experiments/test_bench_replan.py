@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dyngrasp.errors import UnknownName
-from dyngrasp.experiments.bench_replan import bench_replan, end_point_rows, make_cell, qp_problems
+from dyngrasp.experiments.bench_replan import bench_replan, make_cell, qp_problems
+from dyngrasp.experiments.end_point_errors import end_point_rows
 from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.general_solvers import solver_of
 from dyngrasp.planning.replanning.lcqp import sparse_program
@@ -43,7 +44,7 @@ def test_unknown_solvers_are_named():
 
 
 def test_the_exact_step_does_not_miss_and_the_papers_does(cell):
-    rows = end_point_rows(cell, 0)
+    rows = end_point_rows(cell.plan, cell.targets, cell.task, 0)
     exact = [row["error_mm"] for row in rows if row["solver"] == "exact"]
     paper = {row["move"]: row["error_mm"] for row in rows if row["solver"] == "lcqp" and row["duration_weight"] == 1.0}
     assert max(exact) < 1e-9
