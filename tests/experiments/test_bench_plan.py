@@ -51,7 +51,25 @@ def test_the_same_seed_draws_the_same_problems(measured):
 
 def test_report_is_json(measured, tmp_path):
     write_json(tmp_path / "bench.json", measured.report())
-    assert json.loads((tmp_path / "bench.json").read_text())["stages"]
+    rows = json.loads((tmp_path / "bench.json").read_text())["rows"]
+    keys = {"backend", "part", "rho", "grid", "joints", "solved", "median_ms", "p99_ms", "max_ms", "n"}
+    assert all(keys <= row.keys() for row in rows)
+    paper = {(row["part"], row["start"]): row for row in rows if row["case"] == "paper"}
+    assert {"phase1", "phase2", "phase3", "whole", "audit"} <= {part for part, _ in paper}
+    assert (paper["whole", "cold"]["grid"], paper["whole", "cold"]["joints"]) == (100, 7)
+    assert {"objective_rel_diff", "worst_violation"} <= paper["phase1", "warm"].keys()
+
+
+def test_objectives_are_reported_relative_to_the_reference():
+    attempts = [
+        Attempt("paper", 1.0, trial, "approach", solver, 1.0, 5, objective, 0.0, True)
+        for solver, objectives in (("structured", (1.1, 2.0, 3.3)), ("ipopt", (1.0, 2.0, 3.0)))
+        for trial, objective in enumerate(objectives)
+    ]
+    ours, theirs = PlanBenchmark(tuple(attempts), (), (), ("ipopt",), 100, 7).report()["rows"]
+    assert (ours["part"], ours["backend"], theirs["backend"]) == ("phase1", "structured", "ipopt")
+    assert ours["objective_rel_diff"] == pytest.approx(0.1)
+    assert theirs["objective_rel_diff"] == 0.0
 
 
 def test_comparison_counts_pairs():
@@ -62,7 +80,7 @@ def test_comparison_counts_pairs():
     attempts = [attempt(i, "structured", ours, 1.0) for i, (ours, _) in enumerate(pairs)]
     attempts += [attempt(i, "ipopt", theirs, 40.0) for i, (_, theirs) in enumerate(pairs)]
     attempts += [attempt(3, "structured", 1.0, 1.0), attempt(3, "ipopt", np.nan, 90.0, ok=False)]
-    (row,) = PlanBenchmark(tuple(attempts), (), (), ("ipopt",)).comparison_rows()
+    (row,) = PlanBenchmark(tuple(attempts), (), (), ("ipopt",), 100, 7).comparison_rows()
     assert (row["same"], row["better"], row["worse"]) == (1, 1, 1)
     assert (row["problems"], row["both"], row["only_ours"], row["only_theirs"]) == (4, 3, 1, 0)
     assert row["speedup"] == 40.0

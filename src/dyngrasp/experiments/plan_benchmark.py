@@ -12,6 +12,7 @@ from dyngrasp.experiments.statistics import timing_summary
 from dyngrasp.planning.collocation.ipopt import IpoptSettings
 from dyngrasp.planning.collocation.ipopt_compiled import CompiledIpoptSolver
 from dyngrasp.planning.problem import PhaseSolver
+from dyngrasp.trajectory import PHASE_NAMES
 
 PEERS: dict[str, tuple[str, Callable[[], PhaseSolver]]] = {
     "ipopt": (
@@ -30,6 +31,8 @@ WARM = "warm"
 """The default solver after the part has moved by `MOVE` (m), from the solution before; the arm keeps grasp, branch and
 arm angle, as it does when it follows a part."""
 MOVE = 0.01
+
+REFERENCE = "ipopt"
 
 # Objectives that differ by less are those of one optimum (relative).
 SAME = 1e-5
@@ -65,23 +68,71 @@ class Stage:
 
 @dataclass(frozen=True)
 class PlanBenchmark:
-    """Everything measured; `table` and `report` condense it."""
+    """Everything measured, on grids of so many intervals for so many joints; its methods condense it."""
 
     attempts: tuple[Attempt, ...]
     stages: tuple[Stage, ...]
     growth: tuple[dict[str, Any], ...]
     peers: tuple[str, ...]
+    intervals: int
+    joints: int
 
     def report(self) -> dict[str, Any]:
-        """Summaries for JSON: stages and phases by case and weight, comparisons with peers, growth."""
+        """For JSON: what was measured, one row a backend, part and weight, and the comparisons with peers.
+
+        The keys are those of every `bench`: `backend`, `part` (phase1 to phase3, whole, and what else a whole plan
+        takes), `start` (cold or warm), `rho`, `grid` (N), `joints`, `solved`, times, `objective_rel_diff` to the
+        reference IPOPT (the median over what both solved; None without it), `worst_violation`.
+        """
         return {
             "cases": CASES,
             "peers": {name: PEERS[name][0] for name in self.peers},
-            "stages": self.stage_rows(),
-            "phases": self.phase_rows(),
+            "rows": self._part_rows(),
             "comparisons": self.comparison_rows(),
-            "growth": list(self.growth),
         }
+
+    def _part_rows(self) -> list[dict[str, Any]]:
+        size = {"grid": self.intervals, "joints": self.joints}
+        rows: list[dict[str, Any]] = []
+        for row in self.stage_rows():
+            if row["stage"] not in PHASE_NAMES:
+                part = "whole" if row["stage"] == "plan" else row["stage"]
+                rows.append(
+                    {"case": row["case"], "backend": "structured", "start": "cold", "part": part}
+                    | {"rho": row["weight"], **size, "solved": row["ok"]}
+                    | _without(row, "case", "weight", "stage", "ok")
+                )
+        for row in self.phase_rows():
+            warm = row["solver"] == WARM
+            rows.append(
+                {"case": row["case"], "backend": "structured" if warm else row["solver"]}
+                | {"start": "warm" if warm else "cold", "part": f"phase{PHASE_NAMES.index(row['phase']) + 1}"}
+                | {"rho": row["weight"], **size, "solved": row["ok"]}
+                | _without(row, "case", "weight", "phase", "solver", "ok")
+                | {
+                    "objective_rel_diff": self._objective_difference(
+                        row["case"], row["weight"], row["phase"], row["solver"]
+                    )
+                }
+            )
+        rows += [
+            {"case": "growth", "backend": "structured", "start": "cold", "part": "phase1", "rho": row["weight"]}
+            | {"grid": row["intervals"], "joints": row["joints"], "solved": row["ok"]}
+            | _without(row, "weight", "intervals", "joints", "ok")
+            for row in self.growth
+        ]
+        return rows
+
+    def _objective_difference(self, case: str, weight: float, phase: str, solver: str) -> float | None:
+        objectives: dict[str, dict[int, float]] = {solver: {}, REFERENCE: {}}
+        for a in self.attempts:
+            if (a.case, a.weight, a.phase) == (case, weight, phase) and a.solver in objectives and a.ok:
+                objectives[a.solver][a.trial] = a.objective
+        both = objectives[solver].keys() & objectives[REFERENCE].keys()
+        # After a move the problem is another one than the reference's.
+        if solver == WARM or not both:
+            return None
+        return float(np.median([objectives[solver][k] / objectives[REFERENCE][k] - 1 for k in both]))
 
     def stage_rows(self) -> list[dict[str, Any]]:
         """Times of each stage of a whole plan."""
@@ -144,3 +195,7 @@ class PlanBenchmark:
                     }
                 )
         return rows
+
+
+def _without(row: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: value for key, value in row.items() if key not in keys}
