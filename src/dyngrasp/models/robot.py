@@ -94,7 +94,7 @@ class RobotModel:
         """Number of joints."""
         return self.pin_model.nv
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints from the base to the flange."""
         return tuple(self.pin_model.names)[1:]
