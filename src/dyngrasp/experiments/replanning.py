@@ -97,23 +97,25 @@ def pose_source(section: PoseSection, trial: Trial, grasp: Grasp) -> PoseSource:
 
 
 def replanning_summary(events: Sequence[ReplanEvent], not_taken: Sequence[float] = ()) -> dict[str, Any]:
-    """How the replans of an episode ended: counts by way and status, reasons, times (ms).
+    """How the replans of an episode ended: counts by way and status, reasons, and times.
 
-    `too_uncertain` counts the updates that were not taken because of the estimate's covariance; see `not_taken` of
-    `ReplanningLoop`.
+    Times are those of the replans that replaced the plan (ms). `too_uncertain` counts the updates that were not taken
+    because of the estimate's covariance; see `not_taken` of `ReplanningLoop`.
     """
     if not events and not not_taken:
         return {}
-    times = np.array([event.result.timings_ms["total"] for event in events])
+    # A refusal, as while the part is carried, takes next to nothing.
+    replaced = [event for event in events if event.result.ok and not event.late]
+    times = [event.result.timings_ms["total"] for event in replaced]
     return {
         "replans": len(events),
-        "published": sum(event.result.ok and not event.late for event in events),
+        "published": len(replaced),
         "late": sum(event.late for event in events),
         "too_uncertain": len(not_taken),
         "paths": dict(Counter(str(event.result.path) for event in events)),
         "kept_because": dict(Counter(event.result.message for event in events if not event.result.ok)),
-        "median_ms": float(np.median(times)) if events else None,
-        "max_ms": float(times.max()) if events else None,
+        "median_ms": float(np.median(times)) if times else None,
+        "max_ms": max(times, default=None),
     }
 
 

@@ -47,7 +47,7 @@ def run_table(summary: dict[str, Any]) -> Table:
     if replanning:
         published = f"{replanning['published']} of {replanning['replans']}"
         median = replanning["median_ms"]
-        table.add_row("  plans replaced", published, "" if median is None else f"median {median:.1f} ms a cycle")
+        table.add_row("  plans replaced", published, "" if median is None else f"median {median:.1f} ms each")
         if replanning["too_uncertain"]:
             table.add_row("  updates not taken", str(replanning["too_uncertain"]), "pose too uncertain")
     criteria = summary["criteria"]
