@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dyngrasp.errors import InvalidProblem
@@ -193,9 +193,15 @@ def kkt_residuals(p, solution):
         return np.abs(gradient).max() / scale, float(-g.min()), 0.0
     lam, *_ = np.linalg.lstsq(jacobian[:, active], gradient, rcond=None)
     residual = gradient - jacobian[:, active] @ lam
-    return np.abs(residual).max() / np.abs(gradient).max(), float(-g.min()), float(-lam.min() / np.abs(lam).max())
+    # Where the reference is the answer and touches a bound, gradient and multipliers are only rounding; gradients
+    # of this size belong to moves of 1e-10 rad.
+    nothing = 1e-6
+    stationarity = np.abs(residual).max() / max(np.abs(gradient).max(), nothing)
+    return stationarity, float(-g.min()), float(-lam.min() / max(np.abs(lam).max(), nothing))
 
 
+@example(seed=838, move=0.0, speed_share=1.0, held_start=False)
+@example(seed=129, move=0.1, speed_share=1.0, held_start=False)
 @settings(max_examples=60)
 @given(
     seed=st.integers(0, 10**6),

@@ -5,7 +5,7 @@ negative leaves, one that is violated comes in. When neither happens the equatio
 rounding. Hintermüller, Ito, Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM J.
 Optim. 13 (2002). Nothing says that this must end where the guess is poor; then the interior point method goes on.
 
-The equations are solved by the method of multipliers with so high a penalty that two rounds leave nothing: the matrix
+The equations are solved by the method of multipliers with so high a penalty that few rounds leave nothing: the matrix
 keeps the bands of the cost.
 """
 

@@ -35,8 +35,9 @@ LOOK_BELOW, LOOK_NEAR = 0.03, 1e-2
 # this share of their slack.
 FINISH_BELOW, FINISH_NEAR, FINISH_SHARE = 1e-5, 1e-2, 1.0
 
-# Guesses at most, and the penalty in units of the cost over the square of the violation that it is the price of.
-FINISH_ROUNDS, PENALTY = 10, 1e8
+# Guesses at most, and the penalty in units of the cost over the square of the violation that it is the price of. Higher
+# ones cost digits: what rounding leaves of a row times the penalty is an error of its multiplier.
+FINISH_ROUNDS, PENALTY = 10, 1e4
 
 
 @njit(cache=True, error_model="numpy")
