@@ -96,6 +96,7 @@ def near_each_other(motion: Motion, bodies: Bodies, link_pairs: NDArray[np.int64
 def _near_ground(
     R, p, shift, turn, members, firsts, ends, radii, reaches, link_ends, link_radii, link_reaches, horizon
 ):
+    """The arrays of `Candidates`: lower ends of capsules above z = 0, first the one around all bodies of a link."""
     samples = p.shape[2]
     pairs, stops, at, bounds = _space(radii.size, samples)
     n = e = 0
@@ -127,6 +128,10 @@ def _near_ground(
 
 @njit(cache=True, error_model="numpy")
 def _pieces_near_ground(up, origin, shift, turn, low, high, around, reaches, number, start, horizon):
+    """The arrays of `Candidates`: lowest corners of boxes, first the one around all pieces.
+
+    `up` (3, S) and `origin` (S,) are the third row of the pose of their link: what gives heights (m).
+    """
     samples = origin.size
     pairs, stops, at, bounds = _space(reaches.size, samples)
     n = e = 0
@@ -154,6 +159,11 @@ def _near_pieces(
     R, p, shift, turn, members, firsts, ends, halves, rounding, reaches, link_ends, link_radii, link_reaches,
     low, high, around, number, starts, lasts, horizon,
 ):  # fmt: skip
+    """The arrays of `Candidates`: gaps between boxes along the axes of the part.
+
+    First a link as a whole against all pieces, then a body against all, then against each; what is far at one of these
+    steps until some sample is not looked at before it.
+    """
     samples, count = p.shape[2], low.shape[0]
     pairs, stops, at, bounds = _space(reaches.size * count, samples)
     n = e = 0
@@ -207,6 +217,7 @@ def _near_pieces(
 def _near_each_other(
     R, p, shift, turn, members, firsts, ends, radii, reaches, link_ends, link_radii, link_reaches, link_pairs, horizon
 ):
+    """The arrays of `Candidates`: distances of capsules: of two links, then of a body and a link, then of bodies."""
     samples, links = p.shape[2], link_radii.size
     pairs, stops, at, bounds = _space(radii.size**2 // 2, samples)
     n = e = 0
