@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from dyngrasp.errors import PlanningFailed
 from dyngrasp.planning import constraints
 from dyngrasp.planning.collocation import ipopt, transcription
-from dyngrasp.planning.collocation.closed_form import best_duration, integrate, least_cost, least_effort
+from dyngrasp.planning.collocation.closed_form import best_duration, least_cost, least_effort
 from dyngrasp.planning.collocation.ipopt import IpoptSettings, IpoptSolver
 from dyngrasp.planning.collocation.residuals import objective, worst_violation
 from dyngrasp.planning.problem import NodeConstraint, Status
@@ -88,8 +88,9 @@ def test_active_limits_agree_with_another_optimiser(make_problem, solver):
     check(problem, solution)
 
     def motion(x):
-        q, w = integrate(problem.start_position, problem.start_velocity * x[-1], x[:-1].reshape(N + 1, n))
-        return q, w / x[-1], x[:-1].reshape(N + 1, n) / x[-1] ** 2
+        v, dt = x[:-1].reshape(N + 1, n) / x[-1] ** 2, x[-1] / N
+        w = np.cumsum(np.vstack([problem.start_velocity, dt / 2 * (v[1:] + v[:-1])]), axis=0)
+        return np.cumsum(np.vstack([problem.start_position, dt / 2 * (w[1:] + w[:-1])]), axis=0), w, v
 
     def ends(x):
         q, w, _ = motion(x)

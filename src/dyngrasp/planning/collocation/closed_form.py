@@ -17,58 +17,35 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.planning.problem import PhaseProblem
-from dyngrasp.signals import Array, read_only
+from dyngrasp.signals import Array, frozen, read_only
 from dyngrasp.trajectory import Trajectory
 
 # A motion from a state at rest to itself costs least with no duration at all; a trajectory needs one (s).
 SHORTEST_DURATION = 1e-3
 
+Ends = tuple[Array, Array, Array, Array]  # positions and velocities (n,) at the start, then at the end
+Timetables = tuple[tuple[int, ...], ...]
+_STRAIGHT: Timetables = ((),)  # the only timetable of a motion that passes nothing on its way
+_NOWHERE = frozen(np.empty((0, 0)))  # its way points
+
 
 @lru_cache(maxsize=64)
-def _end_map(intervals: int) -> tuple[Array, Array, Array]:
-    """(2, N+1) rows c and d, their (2, 2) Gram matrix and its inverse."""
+def _map(intervals: int, timetables: Timetables) -> tuple[Array, Array, Array]:
+    """Rows of S timetables, their inverse Gram matrices (S, W+2, W+2), and when the W grid points of each are passed.
+
+    Returns:
+        c, d and the same as d for each of the W grid points, (S, W+2, N+1); inverse Gram matrices; s (S, W).
+    """
     h = 1.0 / intervals
     c = np.full(intervals + 1, h)
     c[[0, -1]] = h / 2
-    rows = np.vstack([c, _reach_row(intervals, intervals)])
-    gram = rows @ rows.T
-    return rows, gram, np.linalg.inv(gram)
+    rows = np.array([[c, *(_reach_row(intervals, node) for node in (intervals, *nodes))] for nodes in timetables])
+    inverse = np.asarray(np.linalg.inv(rows @ rows.swapaxes(-1, -2)), dtype=float)
+    return frozen(rows), frozen(inverse), frozen(np.array(timetables, dtype=float) / intervals)
 
 
-def _end_change(problem: PhaseProblem, duration: float) -> Array:
-    """(2, n) what the accelerations must change: of w, and of q beyond coasting."""
-    coasting = duration * problem.start_velocity
-    return np.vstack(
-        [duration * problem.end_velocity - coasting, problem.end_position - problem.start_position - coasting]
-    )
-
-
-def integrate(start_position: Array, start_rate: Array, curvature: Array) -> tuple[Array, Array]:
-    """Positions and rates in normalised time from accelerations in normalised time, by the trapezoidal rule.
-
-    Args:
-        start_position: (n,) q_0.
-        start_rate: (n,) w_0 = T q̇_0.
-        curvature: (N+1, n) a = T² v.
-
-    Returns:
-        q and w, each (N+1, n).
-    """
-    position, rate = np.empty_like(curvature), np.empty_like(curvature)
-    _integrate(start_position, start_rate, curvature, position, rate)
-    return position, rate
-
-
-@njit(cache=True)
-def _integrate(start_position: Array, start_rate: Array, curvature: Array, position: Array, rate: Array) -> None:
-    points, joints = curvature.shape
-    half = 0.5 / (points - 1)
-    for j in range(joints):
-        position[0, j], rate[0, j] = start_position[j], start_rate[j]
-    for k in range(1, points):
-        for j in range(joints):
-            rate[k, j] = rate[k - 1, j] + half * (curvature[k, j] + curvature[k - 1, j])
-            position[k, j] = position[k - 1, j] + half * (rate[k, j] + rate[k - 1, j])
+def _ends(problem: PhaseProblem) -> Ends:
+    return problem.start_position, problem.start_velocity, problem.end_position, problem.end_velocity
 
 
 def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float) -> Trajectory:
@@ -82,15 +59,65 @@ def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float)
         curvature: (N+1, n) accelerations in normalised time, a = T² v.
         duration: T (s).
     """
-    rows, _, gram_inverse = _end_map(problem.intervals)
-    start_rate = duration * problem.start_velocity
-    change = _end_change(problem, duration)
-    curvature = curvature + rows.T @ (gram_inverse @ (change - rows @ curvature))
-    position, rate = integrate(problem.start_position, start_rate, curvature)
-    velocity = rate / duration
+    motion = np.empty((3, *curvature.shape))
+    motion[2] = curvature
+    _meet_ends(problem.intervals, _ends(problem), duration, motion)
+    return Trajectory(duration, *frozen(motion))
+
+
+def _meet_ends(intervals: int, ends: Ends, duration: float, motion: Array) -> None:
+    """Write `nearest_trajectory` (3, N+1, n) in place of the accelerations in normalised time that come last."""
+    rows, gram_inverse, shares = _map(intervals, _STRAIGHT)
+    _close(rows[0], gram_inverse[0], shares[0], _NOWHERE, ends, duration, motion[2])
+    _integrate(ends, duration, motion)
+
+
+@njit(cache=True)
+def _close(
+    rows: Array, gram_inverse: Array, shares: Array, waypoints: Array, ends: Ends, duration: float, curvature: Array
+) -> None:
+    """Add the least Σ|δa|² to a (N+1, n) with which a motion meets its end and passes its way points."""
+    fixed, linear = np.empty(len(rows)), np.empty(len(rows))
+    for j in range(curvature.shape[1]):
+        _changes(shares, waypoints, ends, j, fixed, linear)
+        for row in range(len(rows)):
+            fixed[row] += duration * linear[row]
+            for k in range(len(curvature)):
+                fixed[row] -= rows[row, k] * curvature[k, j]
+        for row in range(len(rows)):
+            weight = 0.0
+            for other in range(len(rows)):
+                weight += gram_inverse[row, other] * fixed[other]
+            for k in range(len(curvature)):
+                curvature[k, j] += weight * rows[row, k]
+
+
+@njit(cache=True)
+def _changes(shares: Array, waypoints: Array, ends: Ends, joint: int, fixed: Array, linear: Array) -> None:
+    """Write fixed + T linear, (W+2,) each: what accelerations change of w, and of q beyond coasting at end and way."""
+    start_position, start_velocity, end_position, end_velocity = ends
+    fixed[0], linear[0] = 0.0, end_velocity[joint] - start_velocity[joint]
+    fixed[1], linear[1] = end_position[joint] - start_position[joint], -start_velocity[joint]
+    for i in range(len(shares)):
+        fixed[2 + i] = waypoints[i, joint] - start_position[joint]
+        linear[2 + i] = -shares[i] * start_velocity[joint]
+
+
+@njit(cache=True)
+def _integrate(ends: Ends, duration: float, motion: Array) -> None:
+    start_position, start_velocity, end_position, end_velocity = ends
+    position, velocity, acceleration = motion
+    half = 0.5 / (len(position) - 1)
+    for j in range(position.shape[1]):
+        position[0, j], velocity[0, j] = start_position[j], duration * start_velocity[j]
+    for k in range(1, len(position)):
+        for j in range(position.shape[1]):
+            velocity[k, j] = velocity[k - 1, j] + half * (acceleration[k, j] + acceleration[k - 1, j])
+            position[k, j] = position[k - 1, j] + half * (velocity[k, j] + velocity[k - 1, j])
+    velocity /= duration
+    acceleration /= duration**2
     # The last grid point is the boundary state itself; the sums above differ from it by rounding only.
-    position[-1], velocity[0], velocity[-1] = problem.end_position, problem.start_velocity, problem.end_velocity
-    return Trajectory(duration, position, velocity, curvature / duration**2)
+    velocity[0], position[-1], velocity[-1] = start_velocity, end_position, end_velocity
 
 
 def least_effort(problem: PhaseProblem, duration: float) -> Trajectory:
@@ -98,32 +125,29 @@ def least_effort(problem: PhaseProblem, duration: float) -> Trajectory:
     return nearest_trajectory(problem, np.zeros((problem.intervals + 1, problem.joints)), duration)
 
 
-def effort_coefficients(problem: PhaseProblem) -> Array:
-    """(3,) c0, c1, c2 of the least Σ|a_k|² = c0 + c1 T + c2 T² over all motions of duration T."""
-    fixed = _end_change(problem, 0.0)
-    return _coefficients(_end_map(problem.intervals)[2], fixed, _end_change(problem, 1.0) - fixed)
-
-
-def _coefficients(gram_inverse: Array, fixed: Array, linear: Array) -> Array:
-    """(..., 3) of the least Σ|a_k|² with which the rows of a map give fixed + T linear, each (..., rows, n)."""
-    by_fixed, by_linear = gram_inverse @ fixed, gram_inverse @ linear
-    products = (fixed * by_fixed, 2.0 * linear * by_fixed, linear * by_linear)
-    return np.stack([product.sum(axis=(-2, -1)) for product in products], axis=-1)
-
-
 def least_cost(problem: PhaseProblem, duration: float) -> float:
     """J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), the objective of `least_effort` (s)."""
-    weight = problem.effort_weight / problem.intervals
-    c0, c1, c2 = effort_coefficients(problem)
-    return float(_cost(c0, c1, c2, weight, duration))
+    _, gram_inverse, shares = _map(problem.intervals, _STRAIGHT)
+    c0, c1, c2 = _effort(gram_inverse[0], shares[0], _NOWHERE, _ends(problem))
+    return _cost(c0, c1, c2, problem.effort_weight / problem.intervals, duration)
 
 
-def best_duration(problem: PhaseProblem) -> float:
-    """The duration within its bounds that minimises J(T).
-
-    An end of the interval or a root of the quartic T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
-    """
-    return float(_best_root(effort_coefficients(problem)[None], problem)[0][0])
+@njit(cache=True)
+def _effort(gram_inverse: Array, shares: Array, waypoints: Array, ends: Ends) -> tuple[float, float, float]:
+    """c0, c1, c2 of the least Σ|a_k|² = c0 + c1 T + c2 T² over all motions of duration T that pass the way points."""
+    fixed, linear = np.empty(len(gram_inverse)), np.empty(len(gram_inverse))
+    c0 = c1 = c2 = 0.0
+    for j in range(ends[0].size):
+        _changes(shares, waypoints, ends, j, fixed, linear)
+        for row in range(fixed.size):
+            by_fixed = by_linear = 0.0
+            for other in range(fixed.size):
+                by_fixed += gram_inverse[row, other] * fixed[other]
+                by_linear += gram_inverse[row, other] * linear[other]
+            c0 += fixed[row] * by_fixed
+            c1 += 2.0 * linear[row] * by_fixed
+            c2 += linear[row] * by_linear
+    return c0, c1, c2
 
 
 @njit(cache=True)
@@ -132,63 +156,78 @@ def _cost(c0: float, c1: float, c2: float, weight: float, duration: float) -> fl
     return duration + weight * ((c0 / duration + c1) / duration + c2) / duration
 
 
-def _best_root(coefficients: Array, problem: PhaseProblem) -> tuple[Array, Array]:
-    """Duration within its bounds that minimises J(T), and J there, for each row of coefficients (S, 3)."""
+def best_duration(problem: PhaseProblem) -> float:
+    """The duration within its bounds that minimises J(T).
+
+    An end of the interval or a root of the quartic T⁴ − (ρ/N)(c2 T² + 2 c1 T + 3 c0) = 0.
+    """
+    return _best(problem, _STRAIGHT, _NOWHERE)[1]
+
+
+def _best(problem: PhaseProblem, timetables: Timetables, waypoints: Array) -> tuple[int, float, float]:
+    """The cheapest of some timetables, the duration within its bounds that minimises J(T), and J there."""
+    _, gram_inverse, shares = _map(problem.intervals, timetables)
     shortest = max(problem.min_duration, min(SHORTEST_DURATION, problem.max_duration))
     weight = problem.effort_weight / problem.intervals
-    durations, costs = np.empty(len(coefficients)), np.empty(len(coefficients))
-    _minimise(coefficients, weight, shortest, problem.max_duration, durations, costs)
-    return durations, costs
+    return _cheapest(gram_inverse, shares, waypoints, _ends(problem), weight, shortest, problem.max_duration)
 
 
 @njit(cache=True)
-def _minimise(
-    coefficients: Array, weight: float, shortest: float, longest: float, durations: Array, costs: Array
-) -> None:
-    """Of the ends of the interval and the roots of the quartic between them the one where J is least.
+def _cheapest(
+    gram_inverse: Array, shares: Array, waypoints: Array, ends: Ends, weight: float, shortest: float, longest: float
+) -> tuple[int, float, float]:
+    best, duration, least = 0, shortest, np.inf
+    for s in range(len(shares)):
+        c0, c1, c2 = _effort(gram_inverse[s], shares[s], waypoints, ends)
+        T, cost = _minimise(c0, c1, c2, weight, shortest, longest)
+        if cost < least:
+            best, duration, least = s, T, cost
+    return best, duration, least
+
+
+@njit(cache=True)
+def _minimise(c0: float, c1: float, c2: float, weight: float, shortest: float, longest: float) -> tuple[float, float]:
+    """Of the ends of the interval and the roots of the quartic between them the one where J is least, and J there.
 
     The quartic p(T) = T⁴ − ρ/N (c2 T² + 2 c1 T + 3 c0) is monotone between neighbouring roots of its derivative, a
     cubic without quadratic term: each such stretch has one root of p at most, found by bisection to the last digit.
     """
-    corners = np.empty(5)
-    for i in range(len(coefficients)):
-        c0, c1, c2 = coefficients[i]
-        best, least = shortest, _cost(c0, c1, c2, weight, shortest)
-        at_end = _cost(c0, c1, c2, weight, longest)
-        if at_end < least:
-            best, least = longest, at_end
-        corners[:] = shortest
-        corners[4] = longest
-        # T³ − m T − k = 0 by Cardano, or by Vieta where there are three roots.
-        m, k = weight * c2 / 2, weight * c1 / 2
-        discriminant = k * k / 4 - m * m * m / 27
-        if discriminant > 0:
-            root = np.sqrt(discriminant)
-            corners[1] = np.cbrt(k / 2 + root) + np.cbrt(k / 2 - root)
-        elif m > 0:
-            radius = np.sqrt(m / 3)
-            angle = np.arccos(min(max(k / 2 / radius**3, -1.0), 1.0)) / 3
-            for j in range(3):
-                corners[1 + j] = 2 * radius * np.cos(angle - 2 * np.pi * j / 3)
-        for j in range(1, 4):
-            corners[j] = min(max(corners[j], shortest), longest)
-        corners.sort()
-        for j in range(4):
-            lower, upper = corners[j], corners[j + 1]
-            rising = _slope(c0, c1, c2, weight, upper) > 0
-            if rising == (_slope(c0, c1, c2, weight, lower) > 0):
-                continue
+    best, least = shortest, _cost(c0, c1, c2, weight, shortest)
+    at_end = _cost(c0, c1, c2, weight, longest)
+    if at_end < least:
+        best, least = longest, at_end
+    corners = np.full(5, shortest)
+    corners[4] = longest
+    # T³ − m T − k = 0 by Cardano, or by Vieta where there are three roots.
+    m, k = weight * c2 / 2, weight * c1 / 2
+    discriminant = k * k / 4 - m * m * m / 27
+    if discriminant > 0:
+        root = np.sqrt(discriminant)
+        corners[1] = np.cbrt(k / 2 + root) + np.cbrt(k / 2 - root)
+    elif m > 0:
+        radius = np.sqrt(m / 3)
+        angle = np.arccos(min(max(k / 2 / radius**3, -1.0), 1.0)) / 3
+        for j in range(3):
+            corners[1 + j] = 2 * radius * np.cos(angle - 2 * np.pi * j / 3)
+    for j in range(1, 4):
+        corners[j] = min(max(corners[j], shortest), longest)
+    corners.sort()
+    for j in range(4):
+        lower, upper = corners[j], corners[j + 1]
+        rising = _slope(c0, c1, c2, weight, upper) > 0
+        if rising == (_slope(c0, c1, c2, weight, lower) > 0):
+            continue
+        middle = (lower + upper) / 2
+        while lower < middle < upper:
+            if (_slope(c0, c1, c2, weight, middle) > 0) == rising:
+                upper = middle
+            else:
+                lower = middle
             middle = (lower + upper) / 2
-            while lower < middle < upper:
-                if (_slope(c0, c1, c2, weight, middle) > 0) == rising:
-                    upper = middle
-                else:
-                    lower = middle
-                middle = (lower + upper) / 2
-            cost = _cost(c0, c1, c2, weight, middle)
-            if cost < least:
-                best, least = middle, cost
-        durations[i], costs[i] = best, least
+        cost = _cost(c0, c1, c2, weight, middle)
+        if cost < least:
+            best, least = middle, cost
+    return best, least
 
 
 @njit(cache=True)
@@ -228,26 +267,12 @@ def optimum_through(
     Returns:
         The motion and its objective (s).
     """
-    rows, gram_inverse = _way_map(problem.intervals, tuple(tuple(nodes) for nodes in timetables))
-    at_ends, at_waypoints = _end_change(problem, 0.0), waypoints - problem.start_position
-    fixed = np.vstack([at_ends, at_waypoints])
-    shares = np.asarray(timetables, dtype=float) / problem.intervals
-    linear = np.empty((len(shares), *fixed.shape))
-    linear[:, :2] = _end_change(problem, 1.0) - at_ends
-    linear[:, 2:] = -shares[..., None] * problem.start_velocity
-    durations, costs = _best_root(_coefficients(gram_inverse, fixed, linear), problem)
-    best = int(costs.argmin())
-    duration = float(durations[best])
-    curvature = rows[best].T @ (gram_inverse[best] @ (fixed + duration * linear[best]))
-    return nearest_trajectory(problem, curvature, duration), float(costs[best])
-
-
-@lru_cache(maxsize=64)
-def _way_map(intervals: int, timetables: tuple[tuple[int, ...], ...]) -> tuple[Array, Array]:
-    """(S, W+2, N+1) rows of both end values and of the positions at W grid points, and their inverse Gram matrices."""
-    ends = _end_map(intervals)[0]
-    rows = np.stack([np.vstack([ends, *(_reach_row(intervals, node) for node in nodes)]) for nodes in timetables])
-    return rows, np.asarray(np.linalg.inv(rows @ rows.swapaxes(-1, -2)), dtype=float)
+    nodes, waypoints = tuple(tuple(row) for row in timetables), read_only(waypoints)
+    best, duration, cost = _best(problem, nodes, waypoints)
+    rows, gram_inverse, shares = _map(problem.intervals, nodes)
+    curvature = np.zeros((problem.intervals + 1, problem.joints))
+    _close(rows[best], gram_inverse[best], shares[best], waypoints, _ends(problem), duration, curvature)
+    return nearest_trajectory(problem, curvature, duration), cost
 
 
 def _reach_row(intervals: int, node: int) -> Array:
@@ -263,13 +288,13 @@ def _reach_row(intervals: int, node: int) -> Array:
 @lru_cache(maxsize=64)
 def rest_to_rest(intervals: int) -> tuple[Array, Array, Array]:
     """Position, rate and curvature, each (N+1,), of the least-effort motion from 0 to 1 at rest, in normalised time."""
-    rows, _, gram_inverse = _end_map(intervals)
-    curvature = rows.T @ (gram_inverse @ np.array([0.0, 1.0]))
-    position, rate = integrate(read_only(np.zeros(1)), np.zeros(1), curvature[:, None])
+    zero, one, motion = frozen(np.zeros(1)), frozen(np.ones(1)), np.zeros((3, intervals + 1, 1))
+    _meet_ends(intervals, (zero, zero, one, zero), 1.0, motion)
+    position, rate, curvature = motion[..., 0]
     # The motion is odd about its middle; averaging with its mirror image takes the summed rounding out of both ends.
-    symmetric_rate = (rate[:, 0] + rate[::-1, 0]) / 2
-    symmetric_position = (position[:, 0] + 1.0 - position[::-1, 0]) / 2
+    symmetric_rate = (rate + rate[::-1]) / 2
+    symmetric_position = (position + 1.0 - position[::-1]) / 2
     symmetric_rate[[0, -1]] = 0.0
     symmetric_position[[0, -1]] = 0.0, 1.0
     odd_curvature = (curvature - curvature[::-1]) / 2
-    return read_only(symmetric_position), read_only(symmetric_rate), read_only(odd_curvature)
+    return frozen(symmetric_position), frozen(symmetric_rate), frozen(odd_curvature)
