@@ -64,3 +64,21 @@ def test_an_operation_without_counterpart_is_refused():
     x = ca.SX.sym("x")
     with pytest.raises(CompilationError, match="not known"):
         node_code.kernel(ca.Function("f", [x], [ca.erf(x)]), "f")
+
+
+def test_sine_and_cosine_are_exact_to_the_last_digits():
+    random = np.random.default_rng(0)
+    ordinary = random.uniform(-10, 10, 4000)
+    # Where a sine is nearly zero, and where 20 bits of quarter turns end.
+    close = np.arange(-2000, 2000) * (np.pi / 2) + random.choice([0.0, 1e-15, 1e-9, -1e-5], 4000)
+    long = np.power(10.0, random.uniform(-12, 9, 4000)) * random.choice([-1.0, 1.0], 4000)
+    edges = np.array([0.0, 2.0**20, np.nextafter(2.0**20, np.inf), -(2.0**20), np.pi / 4, np.nan, np.inf, -np.inf])
+    x = np.concatenate([ordinary, close, long, edges])
+    symbols = [ca.SX.sym("q", 1), ca.SX.sym("v", 1), ca.SX.sym("p", 0)]
+    function = ca.Function("turn", symbols, [ca.vertcat(ca.sin(symbols[0]), ca.cos(symbols[0]))])
+    g = np.empty((x.size, 2))
+    CompiledNodeFunctions(function, "turn").values(x[:, None], np.zeros((x.size, 1)), np.empty((x.size, 0)), g, 0)
+    with np.errstate(invalid="ignore"):
+        expected = np.stack([np.sin(x), np.cos(x)], axis=1)
+    # One unit in the last place from the series, half a unit from rounding, half a unit from the library.
+    np.testing.assert_allclose(g, expected, rtol=2 * float(np.finfo(float).eps), atol=0.0)

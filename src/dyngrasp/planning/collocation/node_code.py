@@ -3,9 +3,16 @@
 CasADi's own generator writes scalar code. Here the operations of a function are written over vectors of eight numbers,
 an extension of C that GCC and Clang share: one instruction then serves as many grid points as the processor is wide.
 Where it is narrower, the compiler splits the vectors.
+
+Sine and cosine are vectors too: every row of an arm begins with those of its joints, and the mathematical library knows
+one number at a time. x = k π/2 + r with |r| ≤ π/4; there Taylor's series are exact to rounding by the ninth term, and
+k mod 4 says which of ± sin r and ± cos r is meant.
 """
 
 from __future__ import annotations
+
+import math
+from fractions import Fraction
 
 import casadi as ca
 
@@ -24,6 +31,8 @@ _ARITHMETIC = {
     ca.OP_SQ: "{0} * {0}",
     ca.OP_TWICE: "2.0 * {0}",
     ca.OP_INV: "1.0 / {0}",
+    ca.OP_SIN: "sine({0}, 0)",
+    ca.OP_COS: "sine({0}, 1)",
 }
 
 # Operations that are taken lane by lane: x and y are numbers.
@@ -33,8 +42,6 @@ _LANE_BY_LANE = {
     ca.OP_EXPM1: "expm1(x)",
     ca.OP_LOG: "log(x)",
     ca.OP_LOG1P: "log1p(x)",
-    ca.OP_SIN: "sin(x)",
-    ca.OP_COS: "cos(x)",
     ca.OP_TAN: "tan(x)",
     ca.OP_ASIN: "asin(x)",
     ca.OP_ACOS: "acos(x)",
@@ -64,10 +71,46 @@ _LANE_BY_LANE = {
     ca.OP_IF_ELSE_ZERO: "x != 0 ? y : 0.0",
 }
 
+# π/2 in three numbers: the product of k, of up to 20 bits, with each of the first two is exact in 53 bits.
+_HALF_PI = Fraction("3.14159265358979323846264338327950288419716939937510582097494459") / 2
+_FIRST = Fraction(round(_HALF_PI * 2**31), 2**31)
+_SECOND = Fraction(round((_HALF_PI - _FIRST) * 2**63), 2**63)
+_PARTS = [float(part).hex() for part in (_FIRST, _SECOND, _HALF_PI - _FIRST - _SECOND)]
+
+
+def _series(powers: range) -> str:
+    """Σ (−1)^i r^(2 i) / n! over every second power n, by Horner's rule in s = r²."""
+    terms = [f"{(-1) ** i / math.factorial(n):.17g}" for i, n in enumerate(powers)]
+    text = terms.pop()
+    while terms:
+        text = f"({text}) * s + {terms.pop()}"
+    return text
+
+
 HEADER = f"""#include <math.h>
 enum {{ LANES = {LANES} }};
 typedef double real __attribute__((vector_size(LANES * sizeof(double))));
+typedef long long whole __attribute__((vector_size(LANES * sizeof(double))));
 typedef long long count;
+
+/* sin(x + turns pi/2) */
+static inline real sine(real x, int turns) {{
+  const whole far = (x > 0x1p20) | (x < -0x1p20);
+  count any = 0;
+  for (int l = 0; l < LANES; ++l) any |= far[l];
+  if (any) {{
+    for (int l = 0; l < LANES; ++l) x[l] = turns ? cos(x[l]) : sin(x[l]);
+    return x;
+  }}
+  /* Of a number as large as this the last bit is one: adding it rounds, and leaves k in the lowest bits. */
+  const double rounding = 0x1.8p52;
+  const real shifted = x * {float(1 / _HALF_PI).hex()} + rounding, k = shifted - rounding;
+  const real r = ((x - k * {_PARTS[0]}) - k * {_PARTS[1]}) - k * {_PARTS[2]}, s = r * r;
+  const real odd = r * ({_series(range(1, 19, 2))});
+  const real even = {_series(range(0, 19, 2))};
+  const whole quadrant = (whole)shifted + turns, other = -(quadrant & 1), sign = (quadrant & 2) << 62;
+  return (real)((((whole)even & other) | ((whole)odd & ~other)) ^ sign);
+}}
 """
 
 
