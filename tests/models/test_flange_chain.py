@@ -1,6 +1,9 @@
 """The compiled chain against Pinocchio, its least rates against numpy's least squares."""
 
+import itertools
+
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from dyngrasp.models.catalogue import load_robot
@@ -40,3 +43,32 @@ def test_no_answer_where_a_direction_is_lost(robot):
     straight = np.zeros(robot.n)
     assert robot.flange_chain.least_rates(straight, np.ones(6)) is None
     assert robot.flange_chain.least_rates(np.full(robot.n, np.nan), np.ones(6)) is None
+
+
+def test_newton_steps_lead_to_a_pose_nearby(robot):
+    for q in postures(robot, 50):
+        if np.linalg.svd(robot.jacobian(q), compute_uv=False)[-1] < 0.1:
+            continue
+        target = robot.forward_kinematics(q + RNG.normal(scale=0.05, size=robot.n))
+        errors = [
+            np.linalg.norm(pin.log6(target.actInv(robot.flange_chain.pose(reached))).vector)
+            for reached in (robot.flange_chain.moved_to(target, q, steps, 1e-9) for steps in range(4))
+        ]
+        # The error of a Newton step is of second order in the error before it, here with a factor of ten at most.
+        assert all(after < 10 * before**2 + 1e-9 for before, after in itertools.pairwise(errors)), errors
+
+
+def test_one_step_is_the_damped_least_squares_of_a_pose_error(robot):
+    for q in postures(robot, 20):
+        here, target = robot.forward_kinematics(q), pin.SE3.Random()
+        J = robot.jacobian(q)
+        twist = np.concatenate([target.translation - here.translation, pin.log3(target.rotation @ here.rotation.T)])
+        step = J.T @ np.linalg.solve(J @ J.T + 0.01 * np.eye(6), twist)
+        # The logarithm loses digits towards half a turn; the condition of the matrix is a few hundred.
+        np.testing.assert_allclose(robot.flange_chain.moved_to(target, q, 1, 0.01), q + step, atol=1e-9)
+
+
+def test_newton_steps_from_a_singular_posture_are_finite(robot):
+    straight = np.zeros(robot.n)
+    assert np.isfinite(robot.flange_chain.moved_to(pin.SE3.Identity(), straight, 3, 1e-6)).all()
+    np.testing.assert_array_equal(straight, 0.0)

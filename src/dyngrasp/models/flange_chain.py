@@ -61,6 +61,20 @@ class FlangeChain:
         missing = least_rates(self.rotations, self.offsets, q, twist_world, rates) if q.size >= 6 else -1.0
         return (rates, missing) if missing >= 0.0 else None
 
+    def moved_to(self, T_world_flange: pin.SE3, q: Array, steps: int, damping: float) -> Array:
+        """The configuration (n,) that Newton steps of least length lead to from q (n,), towards a pose of the flange.
+
+        Args:
+            T_world_flange: The pose.
+            q: Where to begin (rad).
+            steps: How many.
+            damping: Added to the squares of the Jacobian, so that a singular posture gives a finite step.
+        """
+        reached = np.array(q)
+        R, p = T_world_flange.rotation, T_world_flange.translation
+        _move_to(self.rotations, self.offsets, R, p, steps, damping, reached)
+        return reached
+
 
 @njit(cache=True, error_model="numpy")
 def place_frames(rotations, offsets, q, frames):
@@ -87,6 +101,34 @@ def _put_after(before, rotation, offset, frame):
 
 
 @njit(cache=True, error_model="numpy")
+def _jacobian(frames, J):
+    """Write the Jacobian (6, n) of the flange, linear rows before angular ones in world axes, from the frames."""
+    flange = frames[-1]
+    for i in range(J.shape[1]):
+        ax, ay, az = frames[i, 0, 2], frames[i, 1, 2], frames[i, 2, 2]
+        rx, ry, rz = flange[0, 3] - frames[i, 0, 3], flange[1, 3] - frames[i, 1, 3], flange[2, 3] - frames[i, 2, 3]
+        J[0, i], J[1, i], J[2, i] = ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx
+        J[3, i], J[4, i], J[5, i] = ax, ay, az
+
+
+@njit(cache=True, error_model="numpy")
+def _move_to(rotations, offsets, R, p, steps, damping, q):
+    """`FlangeChain.moved_to` in place."""
+    frames, J, twist = np.empty((q.size + 1, 3, 4)), np.empty((6, q.size)), np.empty(6)
+    for _ in range(steps):
+        place_frames(rotations, offsets, q, frames)
+        _jacobian(frames, J)
+        twist[:3] = p - frames[-1, :, 3]
+        turn = R @ frames[-1, :, :3].copy().T
+        for i in range(3):
+            twist[3 + i] = (turn[i - 1, i - 2] - turn[i - 2, i - 1]) / 2
+        sine = np.sqrt((twist[3:] ** 2).sum())
+        if sine > 0.0:
+            twist[3:] *= np.arctan2(sine, (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0) / 2) / sine
+        q += J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), twist)
+
+
+@njit(cache=True, error_model="numpy")
 def least_rates(rotations, offsets, q, twist, rates):
     """`FlangeChain.least_rates`; −1 instead of what is missing where it does not answer.
 
@@ -95,12 +137,7 @@ def least_rates(rotations, offsets, q, twist, rates):
     n = q.size
     frames, J = np.empty((n + 1, 3, 4)), np.empty((6, n))
     place_frames(rotations, offsets, q, frames)
-    for i in range(n):
-        ax, ay, az = frames[i, 0, 2], frames[i, 1, 2], frames[i, 2, 2]
-        rx, ry = frames[n, 0, 3] - frames[i, 0, 3], frames[n, 1, 3] - frames[i, 1, 3]
-        rz = frames[n, 2, 3] - frames[i, 2, 3]
-        J[0, i], J[1, i], J[2, i] = ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx
-        J[3, i], J[4, i], J[5, i] = ax, ay, az
+    _jacobian(frames, J)
     Q, L, y = J.copy(), np.zeros((6, 6)), np.empty(6)
     largest = 0.0
     for row in range(6):

@@ -7,7 +7,6 @@ from functools import lru_cache
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.models.robot import RobotModel
 from dyngrasp.planning.collocation.closed_form import optimum_through
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.grasp_task import GraspTask
@@ -23,7 +22,7 @@ SHARES = np.linspace(0.06, 0.5, 12)
 
 # Newton steps from one way point to the next: centimetres apart, they are then met to a fraction of the funnel's width.
 NEWTON_STEPS = 2
-DAMPING = 1e-6  # of the Jacobian's squares, so that a singular posture gives a finite step
+DAMPING = 1e-6  # of the squares of the Jacobian
 
 
 def descent(problem: PhaseProblem, targets: GraspTargets, task: GraspTask) -> Trajectory | None:
@@ -44,16 +43,17 @@ def descent(problem: PhaseProblem, targets: GraspTargets, task: GraspTask) -> Tr
     if top <= lowest or not timetables:
         return None
     heights = lowest + (top - lowest) * np.array(HEIGHTS)
+    T_object_grasp, T_grasp_flange = targets.grasp.T_object_grasp, task.T_flange_open.inverse()
+    above = [T_object_grasp * pin.SE3(np.eye(3), np.array([0.0, 0.0, h])) * T_grasp_flange for h in heights]
+    end = targets.grasp_time - targets.grasp_duration
 
     def waypoints(before: Array) -> Array:
         """(W, n) postures above the part, where it is so long before the pre-grasp (s)."""
-        found, q, end = [], problem.end_position, targets.grasp_time - targets.grasp_duration
-        for height, dt in zip(heights[::-1], before[::-1], strict=True):
-            T_world_grasp = targets.T_world_object_at(end - dt) * targets.grasp.T_object_grasp
-            above = T_world_grasp * pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
-            q = _moved_to(task.robot, above * task.T_flange_open.inverse(), q)
-            found.insert(0, q)
-        return np.array(found)
+        found, q = np.empty((len(above), problem.joints)), problem.end_position
+        for i in reversed(range(len(above))):
+            T_world_flange = targets.T_world_object_at(end - before[i]) * above[i]
+            found[i] = q = task.robot.flange_chain.moved_to(T_world_flange, q, NEWTON_STEPS, DAMPING)
+        return found
 
     if not targets.moving:
         return optimum_through(problem, timetables, waypoints(np.zeros(len(HEIGHTS))))[0]
@@ -71,15 +71,3 @@ def _timetables(intervals: int) -> tuple[tuple[int, ...], ...]:
     nodes = np.round(intervals * (1 - SHARES[:, None] * np.sqrt(HEIGHTS))).astype(int)
     possible = (np.diff(nodes, axis=1) > 0).all(axis=1) & (nodes[:, 0] >= 1) & (nodes[:, -1] < intervals)
     return tuple(tuple(row) for row in nodes[possible].tolist())
-
-
-def _moved_to(robot: RobotModel, T_world_flange: pin.SE3, q: Array) -> Array:
-    """The configuration that a few Newton steps of least length lead to from q."""
-    for _ in range(NEWTON_STEPS):
-        now = robot.forward_kinematics(q)
-        twist = np.concatenate(
-            [T_world_flange.translation - now.translation, pin.log3(T_world_flange.rotation @ now.rotation.T)]
-        )
-        J = robot.jacobian(q)
-        q = q + J.T @ np.linalg.solve(J @ J.T + DAMPING * np.eye(6), twist)
-    return q
