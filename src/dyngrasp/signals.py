@@ -24,15 +24,15 @@ def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     Raises:
         ValueError: The shape differs.
     """
-    array: Array = values if _is_frozen(values) else np.array(values, dtype=float, order="C")  # type: ignore[assignment]
+    array: Array = values if _is_frozen(values) else frozen(np.array(values, dtype=float, order="C"))  # type: ignore[assignment]
     if shape is not None:
         # A plain loop: this runs many times in every control period.
-        fits = array.ndim == len(shape)
+        fits = len(shape) == array.ndim
         for wanted, size in zip(shape, array.shape, strict=False):
-            fits = fits and wanted in (-1, size)
+            if wanted != size and wanted != -1:
+                fits = False
         if not fits:
             raise ValueError(f"expected shape {shape}, got {array.shape}")
-    array.setflags(write=False)
     return array
 
 
@@ -49,12 +49,9 @@ def _is_frozen(values: ArrayLike) -> bool:
     flags, owner = values.flags, values.base
     if flags.writeable or not flags.c_contiguous:
         return False
-    return flags.owndata if owner is None else type(owner) is np.ndarray and _is_frozen_owner(owner)
-
-
-def _is_frozen_owner(array: Array) -> bool:
-    flags = array.flags
-    return flags.owndata and not flags.writeable
+    if owner is None:
+        return flags.owndata
+    return type(owner) is np.ndarray and owner.flags.owndata and not owner.flags.writeable
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from bisect import bisect_right
@@ -21,6 +22,9 @@ PHASE_NAMES = ("approach", "grasp", "deliver")
 
 # A join is two roundings of the same number, so it may differ by a few ulp of 2π and no more.
 JOIN_TOLERANCE = 1e-9
+
+PhaseArrays = tuple[float, Array, Array, Array]
+Phases = tuple[PhaseArrays, ...]
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,11 @@ class Trajectory:
             raise InvalidTrajectory(f"duration must be a positive number of seconds, got {self.duration}")
         if not _all_finite(q, w, v):
             raise InvalidTrajectory("a trajectory holds finite numbers only")
+
+    @property
+    def arrays(self) -> PhaseArrays:
+        """What compiled code takes for a trajectory: ΔT, q, q̇, q̈."""
+        return self.duration, self.position, self.velocity, self.acceleration
 
     @property
     def intervals(self) -> int:
@@ -142,6 +151,12 @@ def interpolate(duration, position, velocity, acceleration, times, out):
         scaled = min(max(times[m], 0.0), duration) / step
         k = max(min(int(scaled), N - 1), 0)
         s = scaled - k
+        if s == 0.0 or s == 1.0:
+            # Most of what is asked for are grid points.
+            for i in range(n):
+                at = k + int(s)
+                out[0, m, i], out[1, m, i], out[2, m, i] = position[at, i], velocity[at, i], acceleration[at, i]
+            continue
         by_rate, half, sixth, gain = step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12), step * s**2 / 2
         for i in range(n):
             v_k = acceleration[k, i]
@@ -153,17 +168,21 @@ def interpolate(duration, position, velocity, acceleration, times, out):
 
 @njit(cache=True, error_model="numpy")
 def largest_defect(duration, position, velocity, acceleration):
-    """`Trajectory.dynamics_defect`; a NaN is the largest."""
-    half_step, worst = duration / (position.shape[0] - 1) / 2, 0.0
-    for k in range(position.shape[0] - 1):
-        for i in range(position.shape[1]):
-            in_q = position[k + 1, i] - position[k, i] - half_step * (velocity[k + 1, i] + velocity[k, i])
-            in_w = velocity[k + 1, i] - velocity[k, i] - half_step * (acceleration[k + 1, i] + acceleration[k, i])
-            for defect in (abs(in_q), abs(in_w)):
-                # A NaN, once found, stays.
-                if not defect <= worst and worst == worst:
-                    worst = defect
-    return worst
+    """`Trajectory.dynamics_defect`."""
+    half_step, n = duration / (position.shape[0] - 1) / 2, position.shape[1]
+    q, w, v = position.ravel(), velocity.ravel(), acceleration.ravel()
+    return max(_violation(half_step, q[:-n], q[n:], w[:-n], w[n:]), _violation(half_step, w[:-n], w[n:], v[:-n], v[n:]))
+
+
+# A maximum becomes vector instructions where nothing can be a NaN; trajectories hold finite numbers only.
+@njit(cache=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc"})
+def _violation(half_step, x, x_next, rate, rate_next):
+    """Largest |x′ − x − Δt/2 (ẋ′ + ẋ)| of arrays (M,) and their values one grid point later."""
+    most = 0.0
+    for i in range(x.size):
+        defect = abs(x_next[i] - x[i] - half_step * (rate_next[i] + rate[i]))
+        most = defect if defect > most else most
+    return most
 
 
 @dataclass(frozen=True)
@@ -235,11 +254,17 @@ class GraspPlan:
     @cached_property
     def phase_ends(self) -> Array:
         """(3,) times T_1, T_2, T_3 at which the phases end, on the common clock (s)."""
-        return read_only(self.start_time + np.cumsum(self.durations))
+        return read_only(self._ends)
 
     @cached_property
     def _ends(self) -> tuple[float, ...]:
-        return tuple(self.phase_ends.tolist())
+        return tuple(self.start_time + passed for passed in itertools.accumulate(phase.duration for phase in self.arm))
+
+    @cached_property
+    def arrays(self) -> tuple[Phases, Phases, tuple[float, ...]]:
+        """What compiled code takes for a plan: ΔT, q, q̇, q̈ of each phase, of arm and of gripper; T_1, T_2, T_3."""
+        arm, gripper = (tuple(trajectory.arrays for trajectory in phases) for phases in (self.arm, self.gripper))
+        return arm, gripper, self._ends
 
     @property
     def end_time(self) -> float:

@@ -1,7 +1,6 @@
 """For every entry of an audit a plan, a task or a body that makes that one fail and no other."""
 
-import copy
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
@@ -48,8 +47,14 @@ def perturbed(trajectory: Trajectory, direction, start=(0.0, 0.0), end=(0.0, 0.0
 
 def with_arm(plan: GraspPlan, *phases: Trajectory) -> GraspPlan:
     """The plan with other trajectories of the arm, whatever a plan itself would say of them."""
-    bad = copy.copy(plan)
-    object.__setattr__(bad, "arm", phases)
+    return unchecked(plan, arm=phases)
+
+
+def unchecked(plan: GraspPlan, **changes) -> GraspPlan:
+    """The plan with other attributes, whatever a plan itself would say of them."""
+    bad = object.__new__(GraspPlan)
+    for field in fields(GraspPlan):
+        object.__setattr__(bad, field.name, changes.get(field.name, getattr(plan, field.name)))
     return bad
 
 

@@ -11,7 +11,7 @@ from dyngrasp.planning.part_motion import part_motion, part_poses
 from dyngrasp.planning.problem import AuditEntry
 from dyngrasp.trajectory import PHASE_NAMES, Trajectory
 
-from .failing_cases import BODIES, PLANS, TASKS
+from .failing_cases import BODIES, PLANS, TASKS, unchecked
 
 ENTRIES = (
     "dynamics",
@@ -83,9 +83,9 @@ def test_not_a_number_never_passes(plan, targets, task, of, phase, array):
     trajectories = [copy.copy(trajectory) for trajectory in getattr(plan, of)]
     values = getattr(trajectories[phase], array).copy()
     values[17, 1] = np.nan
+    values.setflags(write=False)
     object.__setattr__(trajectories[phase], array, values)
-    bad = copy.copy(plan)
-    object.__setattr__(bad, of, tuple(trajectories))
+    bad = unchecked(plan, **{of: tuple(trajectories)})
     failed = failures(bad, targets, task)
     assert array in failed or f"gripper_{array}" in failed
     if array == "position":

@@ -30,6 +30,11 @@ class Attachments:
     rotations: Array
     positions: Array
 
+    @property
+    def arrays(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """All three, for compiled code."""
+        return self.links, self.rotations, self.positions
+
 
 @dataclass(frozen=True, eq=False)
 class BatchModel:
@@ -81,6 +86,18 @@ class BatchModel:
             gravity=read_only(model.gravity.linear),
         )
 
+    @property
+    def tree(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """What `link_poses` and `frame_poses` take."""
+        return self.parents, self.rotations, self.offsets
+
+    @property
+    def chain(self) -> tuple[Array, ...]:
+        """What `newton_euler` takes: of a tree that is a chain."""
+        return (
+            self.rotations, self.offsets, self.mass, self.first_moment, self.inertia, self.armature, self.gravity
+        )  # fmt: skip
+
     def attach(self, frames: list[tuple[int, pin.SE3]]) -> Attachments:
         """Frames given as (index of the joint in Pinocchio's model, 0 for the world; pose in its joint frame)."""
         links = np.array([joint - 1 for joint, _ in frames], dtype=np.int64)
@@ -94,14 +111,11 @@ class BatchModel:
 
     def poses(self, q: Array, frames: Attachments) -> tuple[Array, Array]:
         """Poses of K frames in the world: rotations (K, 3, 3, M), positions (K, 3, M) for q (n, M)."""
-        return _poses(
-            *cosine_sine(q), self.parents, self.rotations, self.offsets,
-            frames.links, frames.rotations, frames.positions,
-        )  # fmt: skip
+        return frame_poses(*cosine_sine(q), *self.tree, *frames.arrays)
 
     def link_poses(self, q: Array, R: Array, p: Array) -> None:
         """Write the poses of all turned joint frames in the world into R (n, 3, 3, M) and p (n, 3, M), for q (n, M)."""
-        _link_poses(*cosine_sine(q), self.parents, self.rotations, self.offsets, R, p)
+        link_poses(*cosine_sine(q), *self.tree, R, p)
 
     def inverse_dynamics(self, q: Array, w: Array, v: Array) -> tuple[Array, Array]:
         """Recursive Newton-Euler for a chain (each joint on the link before it); q, w, v (n, M).
@@ -110,10 +124,7 @@ class BatchModel:
             Torques (n, M) with gravity and armature (Nm), and the motion of the last link in its turned frame, (9, M):
             angular velocity, angular acceleration, and acceleration of the joint's origin less gravity (m/s²).
         """
-        return _newton_euler(
-            *cosine_sine(q), w, v, self.rotations, self.offsets,
-            self.mass, self.first_moment, self.inertia, self.armature, self.gravity,
-        )  # fmt: skip
+        return newton_euler(*cosine_sine(q), w, v, *self.chain)
 
 
 def wrench_on(body: pin.Inertia, motion: Array) -> Array:
@@ -178,7 +189,7 @@ def cosine_sine(angles):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _link_poses(cosine, sine, parents, rotations, offsets, R, p):
+def link_poses(cosine, sine, parents, rotations, offsets, R, p):
     n, samples = cosine.shape
     for i in range(n):
         fixed, offset = rotations[i], offsets[i]
@@ -196,10 +207,10 @@ def _link_poses(cosine, sine, parents, rotations, offsets, R, p):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _poses(cosine, sine, parents, rotations, offsets, links, link_rotations, link_positions):
+def frame_poses(cosine, sine, parents, rotations, offsets, links, link_rotations, link_positions):
     n, samples = cosine.shape
     R, p = np.empty((n, 3, 3, samples)), np.empty((n, 3, samples))
-    _link_poses(cosine, sine, parents, rotations, offsets, R, p)
+    link_poses(cosine, sine, parents, rotations, offsets, R, p)
     frames = links.size
     out_R, out_p = np.empty((frames, 3, 3, samples)), np.empty((frames, 3, samples))
     for f in range(frames):
@@ -228,7 +239,7 @@ def compose(R, p, turn, shift, out_R, out_p):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _newton_euler(cosine, sine, w, v, rotations, offsets, mass, first_moment, inertia, armature, gravity):
+def newton_euler(cosine, sine, w, v, rotations, offsets, mass, first_moment, inertia, armature, gravity):
     n, samples = cosine.shape
     E, wrench = np.empty((n, 3, 3, samples)), np.empty((n, 6, samples))
     motion, moved = np.zeros((9, samples)), np.empty((9, samples))

@@ -8,20 +8,19 @@ a constraint could be broken there.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 
-from dyngrasp.models.batch_dynamics import compose
+from dyngrasp.models.batch_dynamics import compose, cosine_sine, link_poses
 from dyngrasp.planning.clearance import clearance_entries
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.part_motion import PartMotion, part_motion
 from dyngrasp.planning.plan_samples import at_grid_points, between, waypoints_of
 from dyngrasp.planning.problem import AuditEntry, AuditReport
-from dyngrasp.planning.worst_values import ROWS, PlanModels, hand_in_grasp_frame, plan_models
+from dyngrasp.planning.worst_values import ROWS, PlanModels, hand_in_grasp_frame, plan_models, side_by_side
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, largest_defect, largest_difference
 
@@ -72,8 +71,7 @@ def audit(
     models, part = plan_models(task, targets.grasp.name), part_motion(targets)
     return AuditReport(
         (
-            _dynamics(plan),
-            *_joins(plan),
+            *_consistency(plan),
             *_boundaries(plan, targets, part, models, task.settings.pregrasp_distance, since),
             *_along(plan, part, models, since, wall),
             *clearance_entries(task, targets, waypoints_of(plan, since)),
@@ -92,40 +90,39 @@ def standstill(plan: GraspPlan, task: GraspTask, since: float = -np.inf) -> Audi
         task: Arm and its limits.
         since: What comes before this time (s) is past.
     """
-    span = AT_REST * (plan.end_time - plan.start_time)
-    first, last = max(since, plan.start_time + span), plan.end_time - span
-    slowest, time = np.inf, last
-    for arm, T in zip(plan.arm, plan.phase_ends.tolist(), strict=True):
-        begin, limit = T - arm.duration, task.robot.limits.velocity
-        speed, at = _slowest(arm.duration, arm.velocity, arm.acceleration, limit, first - begin, last - begin)
-        # A NaN, once found, stays.
-        if not speed >= slowest and slowest == slowest:
-            slowest, time = speed, begin + at
+    arm, _, ends = plan.arrays
+    slowest, time = _slowest(arm, ends, task.robot.limits.velocity, since, AT_REST * (plan.end_time - plan.start_time))
     return AuditEntry("standstill", slowest, LEAST_SPEED, True, 0.0, "of limit", time)
 
 
 @njit(cache=True)
-def _slowest(duration, velocity, acceleration, limit, first, last):
-    """Least max-norm of velocities (N+1, n) over their limits from `first` to `last` (s), and its time.
+def _slowest(arm, ends, limit, since, at_ends):
+    """Least max-norm of velocities over their limits (n,) from `since` on, but for a time `at_ends` of a plan (s).
 
-    Looked at are the grid points and, half way between them, the quadratic that the velocity is there.
+    Looked at are the grid points and, half way between them, the quadratic that the velocity is there; the time of what
+    is found comes second.
     """
-    N, n = velocity.shape[0] - 1, velocity.shape[1]
-    step, least, time = duration / N, np.inf, last
-    for half in range(2 * N + 1):
-        t, k = half * step / 2, half // 2
-        if t < first or t > last:
-            continue
-        speed = 0.0
-        for i in range(n):
-            w = velocity[k, i]
-            if half % 2:
-                w = (w + velocity[k + 1, i]) / 2 - step / 8 * (acceleration[k + 1, i] - acceleration[k, i])
-            share = abs(w) / limit[i]
-            if not share <= speed and speed == speed:
-                speed = share
-        if not speed >= least and least == least:
-            least, time = speed, t
+    first, last = max(since, ends[0] - arm[0][0] + at_ends), ends[2] - at_ends
+    least, time = np.inf, last
+    for i in range(3):
+        duration, _, velocity, acceleration = arm[i]
+        N, begin = velocity.shape[0] - 1, ends[i] - duration
+        step = duration / N
+        for half in range(2 * N + 1):
+            t, k = begin + half * step / 2, half // 2
+            if t < first or t > last:
+                continue
+            speed = 0.0
+            for j in range(limit.size):
+                w = velocity[k, j]
+                if half % 2:
+                    w = (w + velocity[k + 1, j]) / 2 - step / 8 * (acceleration[k + 1, j] - acceleration[k, j])
+                share = abs(w) / limit[j]
+                if not share <= speed and speed == speed:
+                    speed = share
+            # A NaN, once found, stays.
+            if not speed >= least and least == least:
+                least, time = speed, t
     return least, time
 
 
@@ -154,89 +151,92 @@ def _worse(one: list[float], other: list[float], row: tuple[str, bool, str]) -> 
     return one if other[2] < 0.0 or value != value or less <= value else other
 
 
-def _dynamics(plan: GraspPlan) -> AuditEntry:
-    defects = [
-        largest_defect(x.duration, x.position, x.velocity, x.acceleration)
-        for phase in zip(plan.arm, plan.gripper, strict=True)
-        for x in phase
-    ]
+def _consistency(plan: GraspPlan) -> list[AuditEntry]:
+    """Defects of the dynamics, and jumps of position and velocity at T_1 and T_2, over arm and gripper."""
+    arm, gripper, ends = plan.arrays
+    defects, *jumps = _violations(arm, gripper)
     worst = _worst_of(defects)
-    start, phase = float(plan.phase_ends[worst // 2]) - plan.arm[worst // 2].duration, PHASE_NAMES[worst // 2]
-    return AuditEntry("dynamics", defects[worst], 0.0, False, 1e-9, "rad, rad/s", start, phase)
-
-
-def _joins(plan: GraspPlan) -> list[AuditEntry]:
-    """Jumps of position and velocity at T_1 and T_2, over arm and gripper."""
-    pairs = (*itertools.pairwise(plan.arm), *itertools.pairwise(plan.gripper))
-    jumps = [_jumps(a.position, a.velocity, b.position, b.velocity) for a, b in pairs]
-    entries = []
-    for name, unit, found in zip(("position", "velocity"), ("rad", "rad/s"), zip(*jumps, strict=True), strict=True):
+    start, phase = ends[worst] - arm[worst][0], PHASE_NAMES[worst]
+    entries = [AuditEntry("dynamics", defects[worst], 0.0, False, 1e-9, "rad, rad/s", start, phase)]
+    for name, unit, found in zip(("position", "velocity"), ("rad", "rad/s"), jumps, strict=True):
         worst = _worst_of(found)
-        time = float(plan.phase_ends[worst % 2])
-        entries.append(AuditEntry(f"join_{name}", found[worst], 0.0, False, JOIN_TOLERANCE, unit, time))
+        entries.append(AuditEntry(f"join_{name}", found[worst], 0.0, False, JOIN_TOLERANCE, unit, ends[worst]))
     return entries
 
 
-def _worst_of(values: Sequence[float]) -> int:
+def _worst_of(values: tuple[float, ...]) -> int:
     """Index of the first NaN, or else of the largest."""
     return max(range(len(values)), key=lambda i: np.inf if values[i] != values[i] else values[i])
 
 
 @njit(cache=True)
-def _jumps(q, w, next_q, next_w):
-    return largest_difference(q[-1], next_q[0]), largest_difference(w[-1], next_w[0])
+def _violations(arm, gripper):
+    """Of the dynamics in each phase, of continuity of position and of velocity at each join; a NaN is the largest."""
+    defects, jumps = np.zeros(3), np.zeros((2, 2))
+    for phases in (arm, gripper):
+        for i in range(3):
+            defects[i] = _larger(largest_defect(*phases[i]), defects[i])
+        for i in range(2):
+            (_, q, w, _), (_, q_next, w_next, _) = phases[i], phases[i + 1]
+            jumps[0, i] = _larger(largest_difference(q[-1], q_next[0]), jumps[0, i])
+            jumps[1, i] = _larger(largest_difference(w[-1], w_next[0]), jumps[1, i])
+    return (defects[0], defects[1], defects[2]), (jumps[0, 0], jumps[0, 1]), (jumps[1, 0], jumps[1, 1])
+
+
+@njit(cache=True)
+def _larger(a, b):
+    return b if a <= b or b != b else a
 
 
 def _boundaries(
     plan: GraspPlan, targets: GraspTargets, part: PartMotion, models: PlanModels, above: float, since: float
 ) -> list[AuditEntry]:
     """Where the hand really is at T_1, T_2, T_3, from the plan's joints alone, against where it was sent."""
-    q = np.array([*(phase.position[-1] for phase in plan.arm), targets.place.position]).T
-    q_h = np.array([*(phase.position[-1] for phase in plan.gripper), targets.gripper_closed]).T
-    both = models.configurations(q, q_h)
-    R, p = np.empty((len(both), 3, 3, 4)), np.empty((len(both), 3, 4))
-    models.hand.link_poses(both, R, p)
-    frames, w, ends = models.hand_frames, plan.arm[1].velocity[-1], plan.phase_ends
-    errors, lift = _boundary_errors(
-        R, p, frames.links, frames.rotations, frames.positions, *part, *models.grasp_on_part, ends, above,
-        targets.moving, models.arm_indices, w,
+    arm, gripper, ends = plan.arrays
+    errors, lift, rest = _boundary_errors(
+        arm, gripper, ends, targets.place.position, targets.gripper_closed, models.hand, part, models.grasp_on_part,
+        above, targets.moving,
     )  # fmt: skip
     entries = []
     names = ("pregrasp", "grasp", "place")
-    for time, name, (distance, angle) in zip(ends.tolist(), names, errors.tolist(), strict=True):
+    for time, name, (distance, angle) in zip(ends, names, errors.tolist(), strict=True):
         if time >= since:
             entries.append(AuditEntry(f"{name}_position", distance, 0.0, False, LENGTH_TOLERANCE, "m", time))
             entries.append(AuditEntry(f"{name}_angle", angle, 0.0, False, 1e-5, "rad", time))
-    entries.append(AuditEntry("lift_velocity", lift, 0.0, True, LENGTH_TOLERANCE, "m/s", float(ends[1])))
-    rest = float(np.abs(plan.arm[2].velocity[-1]).max())
-    entries.append(AuditEntry("rest_at_place", rest, 0.0, False, JOIN_TOLERANCE, "rad/s", plan.end_time))
+    entries.append(AuditEntry("lift_velocity", lift, 0.0, True, LENGTH_TOLERANCE, "m/s", ends[1]))
+    entries.append(AuditEntry("rest_at_place", rest, 0.0, False, JOIN_TOLERANCE, "rad/s", ends[2]))
     return entries
 
 
 @njit(cache=True, error_model="numpy")
-def _boundary_errors(
-    R, p, links, turns, shifts, rotation, position, twist, arrival, R_part_grasp, p_part_grasp, ends, above, moving,
-    arm, w,
-):  # fmt: skip
-    """Distance (m) and angle (rad) of the hand from where it was sent, (3, 2), and its velocity upwards at the grasp.
+def _boundary_errors(arm, gripper, ends, q_place, q_h_place, hand, part, grasp_on_part, above, moving):
+    """Distance (m) and angle (rad) of the hand from where it was sent at the ends of the phases, (3, 2).
 
-    Links (n, 3, 3, 4), (n, 3, 4) are posed as at the ends of the phases and as the place asks for. The hand was sent
-    `above` the grasp frame, onto it, and to the place. The arm has velocities w (n,) at the grasp.
+    It was sent `above` the grasp frame, onto it, and to where a posture of arm and gripper has it at the place. Second
+    comes its velocity upwards at the grasp (m/s), third the largest velocity of a joint at the place (rad/s).
     """
+    arm_indices, hand_indices, tree, (links, turns, shifts) = hand
+    q, q_h = np.empty((q_place.size, 4)), np.empty((q_h_place.size, 4))
+    for i in range(3):
+        q[:, i], q_h[:, i] = arm[i][1][-1], gripper[i][1][-1]
+    q[:, 3], q_h[:, 3] = q_place, q_h_place
+    both = side_by_side(q, q_h, arm_indices, hand_indices)
+    R, p = np.empty((both.shape[0], 3, 3, 4)), np.empty((both.shape[0], 3, 4))
+    link_poses(*cosine_sine(both), *tree, R, p)
     hand_R, hand_p = np.empty((3, 3, 3, 4)), np.empty((3, 3, 4))
     for f in range(3):
         compose(R[links[f]], p[links[f]], turns[f], shifts[f], hand_R[f], hand_p[f])
-    offset, angle = hand_in_grasp_frame(
-        hand_R, hand_p, rotation, position, twist, arrival, R_part_grasp, p_part_grasp, ends
-    )
+    times = np.array([ends[0], ends[1], ends[2]])
+    offset, angle = hand_in_grasp_frame(hand_R, hand_p, *part, *grasp_on_part, times)
     offset[2, 0] -= above
     if moving:
         # A part that is not taken when it was to be rides on.
+        rotation, _, twist, arrival = part
         late = max(ends[1] - arrival, 0.0)
         for a in range(3):
             for b in range(3):
                 for c in range(3):
-                    offset[a, 1] -= late * R_part_grasp[b, a] * rotation[c, b] * twist[c]
+                    offset[a, 1] -= late * grasp_on_part[0][b, a] * rotation[c, b] * twist[c]
     chord = 0.0
     for a in range(3):
         offset[a, 2] = (hand_p[1, a, 2] + hand_p[2, a, 2] - hand_p[1, a, 3] - hand_p[2, a, 3]) / 2
@@ -247,13 +247,14 @@ def _boundary_errors(
     for k in range(3):
         errors[k, 0] = np.sqrt(offset[0, k] ** 2 + offset[1, k] ** 2 + offset[2, k] ** 2)
         errors[k, 1] = angle[k]
-    lift = 0.0
-    for i in range(arm.size):
-        j = arm[i]
+    lift, w = 0.0, arm[1][2][-1]
+    for i in range(arm_indices.size):
+        j = arm_indices[i]
         # Third row of axis × lever, for a joint that turns about its z axis.
         x, y = (
             (hand_p[1, 0, 1] + hand_p[2, 0, 1]) / 2 - p[j, 0, 1],
             (hand_p[1, 1, 1] + hand_p[2, 1, 1]) / 2 - p[j, 1, 1],
         )
         lift += w[i] * (R[j, 0, 2, 1] * y - R[j, 1, 2, 1] * x)
-    return errors, lift
+    last = arm[2][2][-1]
+    return errors, lift, largest_difference(last, np.zeros(last.size))

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import GraspPlan, Trajectory, interpolate, largest_difference
+from dyngrasp.trajectory import GraspPlan, interpolate
 
 # Samples of an interval between two grid points in which a constraint could be broken: a velocity, quadratic in
 # between, is then seen to 1/256 of its height.
@@ -48,110 +48,110 @@ class Waypoints:
 
 def at_grid_points(plan: GraspPlan, since: float) -> PlanSamples:
     """The plan on its grids, and at `since`; on the finer one where arm and gripper have different grids."""
-    chosen = []
-    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), strict=True):
-        local = _finer_grid(arm, gripper)
-        cut = since - (T - arm.duration)
-        if cut > 0.0:
-            local = np.concatenate(([cut], local[np.searchsorted(local, cut, "right") :])) if since < T else local[:0]
-        chosen.append(local)
-    return _sampled(plan, chosen)
-
-
-def _finer_grid(arm: Trajectory, gripper: Trajectory) -> Array:
-    N = max(arm.intervals, gripper.intervals)
-    grid: Array = np.arange(N + 1.0) * (arm.duration / N)
-    grid[N] = arm.duration
-    return grid
+    return PlanSamples(*_on_grids(*plan.arrays, since))
 
 
 def between(plan: GraspPlan, grid: PlanSamples, suspects: NDArray[np.bool_]) -> PlanSamples:
     """Samples inside the intervals that begin at the marked ones (M,) of the samples `grid`."""
-    chosen, first = [], 0
-    for arm, T, stop in zip(plan.arm, plan.phase_ends.tolist(), grid.stops, strict=True):
-        local = grid.times[first:stop] - (T - arm.duration)
-        k = np.flatnonzero(suspects[first:stop])
-        inside = local[k, None] + np.diff(local)[k, None] * (np.arange(1, SUBSTEPS) / SUBSTEPS)
-        chosen.append(inside.ravel())
-        first = stop
-    return _sampled(plan, chosen)
-
-
-def _sampled(plan: GraspPlan, chosen: list[Array]) -> PlanSamples:
-    """The plan at times of each phase, counted from its beginning (s)."""
-    closing = chosen[0].size
-    lifted = closing + chosen[1].size
-    samples = lifted + chosen[2].size
-    times = np.empty(samples)
-    both = [np.empty((3, len(names), samples)) for names in (plan.arm_joints, plan.gripper_joints)]
-    first = 0
-    for arm, gripper, T, local in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), chosen, strict=True):
-        if local.size:
-            times[first : first + local.size] = T - arm.duration + local
-            for x, out in zip((arm, gripper), both, strict=True):
-                _write(*_states(x, local), out, first)
-        first += local.size
-    return PlanSamples(times, both[0], both[1], (closing, lifted, samples))
-
-
-def _states(trajectory: Trajectory, local: Array) -> tuple[Array, Array, Array]:
-    """`Trajectory.sample_many`, for nothing where all grid points are asked for."""
-    if local.size == trajectory.intervals + 1 and local[0] == 0.0:
-        return trajectory.position, trajectory.velocity, trajectory.acceleration
-    return trajectory.sample_many(local)
-
-
-@njit(cache=True)
-def _write(q, w, v, out, first):
-    """Write states (M, n) into out (3, n, ≥ M) from column `first` on."""
-    for i in range(q.shape[1]):
-        for k in range(q.shape[0]):
-            out[0, i, first + k], out[1, i, first + k], out[2, i, first + k] = q[k, i], w[k, i], v[k, i]
+    return PlanSamples(*_inside(*plan.arrays, grid.times, grid.stops, suspects))
 
 
 def waypoints_of(plan: GraspPlan, since: float = -np.inf) -> Waypoints:
     """Samples of a plan from `since` (s) on, `JOINT_STEP` or less apart, with both ends of each phase."""
-    tables, counts = [], []
-    for arm, gripper, T in zip(plan.arm, plan.gripper, plan.phase_ends.tolist(), strict=True):
-        begin = T - arm.duration
-        if since >= T:
-            counts.append(0)
-            continue
-        grid = _finer_grid(arm, gripper)
-        both = [x.position if len(x.position) == grid.size else x.sample_many(grid)[0] for x in (arm, gripper)]
-        local = _steps(grid, both[0], both[1], max(since - begin, 0.0))
-        tables.append(
-            (
-                begin + local,
-                _positions(arm.duration, arm.position, arm.velocity, arm.acceleration, local),
-                _positions(gripper.duration, gripper.position, gripper.velocity, gripper.acceleration, local),
-            )
-        )
-        counts.append(local.size)
-    times, q, q_h = (np.concatenate(column, axis=-1) for column in zip(*tables, strict=True))
-    return Waypoints(times, q, q_h, counts[0], counts[0] + counts[1])
+    return Waypoints(*_along_paths(*plan.arrays, since))
 
 
 @njit(cache=True, error_model="numpy")
-def _positions(duration, position, velocity, acceleration, local):
-    """Positions (n, M) at local times (M,) (s)."""
-    states = np.empty((3, local.size, position.shape[1]))
-    interpolate(duration, position, velocity, acceleration, local, states)
-    return states[0].T.copy()
+def _on_grids(arm, gripper, ends, since):
+    most = 0
+    for i in range(3):
+        most += max(arm[i][1].shape[0], gripper[i][1].shape[0]) + 1
+    local, stops, count = np.empty(most), np.zeros(3, np.int64), 0
+    for i in range(3):
+        duration, N = arm[i][0], max(arm[i][1].shape[0], gripper[i][1].shape[0]) - 1
+        begin = ends[i] - duration
+        if since < ends[i]:
+            first = 0
+            if since > begin:
+                local[count] = since - begin
+                count += 1
+                while first <= N and first * (duration / N) <= since - begin:
+                    first += 1
+            for k in range(first, N):
+                local[count] = k * (duration / N)
+                count += 1
+            local[count] = duration
+            count += 1
+        stops[i] = count
+    return _states(arm, gripper, ends, local[:count], stops)
 
 
 @njit(cache=True, error_model="numpy")
-def _steps(grid, q, q_h, start):
-    """Times from `start` to the last of `grid` (M,), equidistant on the path of q (M, n) and q_h (M, m).
+def _inside(arm, gripper, ends, times, grid_stops, suspects):
+    local, stops = np.empty(SUBSTEPS * suspects.sum()), np.zeros(3, np.int64)
+    count = start = 0
+    for i in range(3):
+        begin = ends[i] - arm[i][0]
+        for k in range(start, grid_stops[i]):
+            if suspects[k]:
+                for part in range(1, SUBSTEPS):
+                    local[count] = times[k] - begin + part / SUBSTEPS * (times[k + 1] - times[k])
+                    count += 1
+        start = stops[i] = grid_stops[i]
+        stops[i] = count
+    return _states(arm, gripper, ends, local[:count], stops)
 
-    The path counts in the largest joint step of each interval (rad).
+
+@njit(cache=True, error_model="numpy")
+def _along_paths(arm, gripper, ends, since):
+    count, local = 0, np.empty(0)
+    stops = np.zeros(3, np.int64)
+    for i in range(3):
+        if since < ends[i]:
+            steps = _steps(arm[i], gripper[i], max(since - (ends[i] - arm[i][0]), 0.0))
+            local = np.concatenate((local, steps))
+        stops[i] = local.size
+    times, q, q_h, _ = _states(arm, gripper, ends, local, stops)
+    return times, q[0], q_h[0], stops[0], stops[1]
+
+
+@njit(cache=True, error_model="numpy")
+def _states(arm, gripper, ends, local, stops):
+    """Arrays of `PlanSamples` at times of each phase, counted from its beginning (s)."""
+    times = np.empty(local.size)
+    both = np.empty((3, arm[0][1].shape[1], local.size)), np.empty((3, gripper[0][1].shape[1], local.size))
+    start = 0
+    for i in range(3):
+        stop = stops[i]
+        for k in range(start, stop):
+            times[k] = ends[i] - arm[i][0] + local[k]
+        for trajectory, out in ((arm[i], both[0]), (gripper[i], both[1])):
+            interpolate(*trajectory, local[start:stop], out[:, :, start:stop].transpose(0, 2, 1))
+        start = stop
+    return times, both[0], both[1], (stops[0], stops[1], stops[2])
+
+
+@njit(cache=True, error_model="numpy")
+def _steps(arm, gripper, start):
+    """Times of a phase from `start` (s) to its end, equidistant on the path of its joints.
+
+    The path counts in the largest step of arm and of gripper from grid point to grid point (rad).
     """
-    last = grid.size - 1
-    path = np.zeros(grid.size)
-    for k in range(last):
-        # Where both stand still the path needs a slope too, for times to be read from it.
-        path[k + 1] = path[k] + largest_difference(q[k + 1], q[k]) + largest_difference(q_h[k + 1], q_h[k]) + 1e-9
-    if not np.isfinite(path[last]):
+    last = max(arm[1].shape[0], gripper[1].shape[0]) - 1
+    grid = np.arange(last + 1) * (arm[0] / last)
+    grid[last] = arm[0]
+    # Where both stand still the path needs a slope too, for times to be read from it.
+    path = np.full(grid.size, 1e-9)
+    path[0] = 0.0
+    for trajectory in (arm, gripper):
+        if trajectory[1].shape[0] == grid.size:
+            _add_steps(trajectory[1], path)
+        else:
+            states = np.empty((3, grid.size, trajectory[1].shape[1]))
+            interpolate(*trajectory, grid, states)
+            _add_steps(states[0], path)
+    path = np.cumsum(path)
+    if not path[last] < np.inf:
         # A number that is none is looked at.
         return grid[grid >= start]
     k = 0
@@ -159,11 +159,23 @@ def _steps(grid, q, q_h, start):
         k += 1
     begin = path[k] + (path[k + 1] - path[k]) * (start - grid[k]) / (grid[k + 1] - grid[k])
     count = max(int(np.ceil((path[last] - begin) / JOINT_STEP)), 1)
-    times = np.empty(count + 1)
+    stride, times = (path[last] - begin) / count, np.empty(count + 1)
     times[0], times[count] = start, grid[last]
     for i in range(1, count):
-        along = begin + (path[last] - begin) / count * i
+        along = begin + stride * i
         while path[k + 1] < along and k + 1 < last:
             k += 1
         times[i] = grid[k] + (grid[k + 1] - grid[k]) * (along - path[k]) / (path[k + 1] - path[k])
     return times
+
+
+@njit(cache=True, error_model="numpy")
+def _add_steps(position, path):
+    """Add the largest step of any joint to each grid point of positions (M, n) to path (M,)."""
+    for k in range(1, path.size):
+        largest = nothing = 0.0
+        for i in range(position.shape[1]):
+            step = abs(position[k, i] - position[k - 1, i])
+            # A NaN is lost in the comparison and kept in the sum.
+            largest, nothing = max(largest, step), nothing + 0.0 * step
+        path[k] += largest + nothing

@@ -10,7 +10,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from dyngrasp.models.assembly import assemble
-from dyngrasp.models.batch_dynamics import Attachments, BatchModel, compose, newton
+from dyngrasp.models.batch_dynamics import (
+    Attachments,
+    BatchModel,
+    compose,
+    cosine_sine,
+    frame_poses,
+    newton,
+    newton_euler,
+)
 from dyngrasp.models.kinematic_tree import frames_named
 from dyngrasp.models.pinch import Pinch, pad_loads
 from dyngrasp.planning.grasp_task import GraspTask
@@ -51,23 +59,23 @@ class PlanModels:
 
     Attributes:
         bounds: (12,) of `ROWS`.
-        hand: Arm and hand as one tree.
-        hand_frames: A frame of the hand, turned like the grasp, and those of both pads.
+        hand: Where the joints of arm and hand are in their tree; the tree; a frame of the hand, turned like the grasp,
+            and those of both pads.
         grasp_on_part: Rotation (3, 3) and position (3,) of the grasp frame in the part's.
-        arm_indices: Where the joints of the arm are among those of the tree.
     """
 
     def __init__(self, task: GraspTask, grasp_name: str) -> None:
         grasp = next(grasp for grasp in task.grasp_object.grasps if grasp.name == grasp_name)
         robot, part, settings, gripper = task.robot, task.grasp_object, task.settings, task.gripper
-        self.empty = BatchModel.from_pinocchio(task.robot_empty.loaded_model)
-        self.loaded = BatchModel.from_pinocchio(task.robot_loaded(grasp).loaded_model)
+        loaded = BatchModel.from_pinocchio(task.robot_loaded(grasp).loaded_model)
+        self._empty, self._loaded = BatchModel.from_pinocchio(task.robot_empty.loaded_model).chain, loaded.chain
         assembly = assemble(robot, gripper)
-        self.hand = BatchModel.from_pinocchio(assembly.pin_model)
-        self.arm_indices, self._hand_indices = assembly.arm_indices, assembly.hand_indices
-        self.hand_frames = self._frames(assembly.pin_model, assembly.flange_id, task)
+        tree = BatchModel.from_pinocchio(assembly.pin_model)
+        self.hand = (
+            assembly.arm_indices, assembly.hand_indices, tree.tree, self._frames(tree, assembly.pin_model, assembly.flange_id, task).arrays
+        )
         self.grasp_on_part = read_only(grasp.T_object_grasp.rotation), read_only(grasp.T_object_grasp.translation)
-        held = self.loaded.attach([(robot.n, robot.T_last_flange * task.T_flange_closed(grasp))])
+        held = loaded.attach([(robot.n, robot.T_last_flange * task.T_flange_closed(grasp))])
         T_link_held = pin.SE3(held.rotations[0], held.positions[0])
         body = (T_link_held * grasp.T_object_grasp.inverse()).act(part.spatial_inertia)
         self._held = (
@@ -75,26 +83,22 @@ class PlanModels:
             held.rotations[0], held.positions[0], Pinch(*(float(x) for x in task.pinch(grasp))),
         )  # fmt: skip
         limits = robot.limits
-        self._arm_limits = _boxes(limits.position_lower, limits.position_upper, limits.velocity, limits.acceleration)
-        self._gripper_limits = _boxes(gripper.lower, gripper.upper, gripper.velocity, gripper.acceleration)
-        self._torque = read_only(limits.torque)
+        self._limits = (
+            _boxes(limits.position_lower, limits.position_upper, limits.velocity, limits.acceleration),
+            _boxes(gripper.lower, gripper.upper, gripper.velocity, gripper.acceleration),
+            read_only(limits.torque),
+        )
         funnel = part.funnel
         self._funnel = float(funnel.sigma_x), float(funnel.sigma_y), float(funnel.z_threshold)
         tolerances = settings.lateral_tolerance, -settings.dip_tolerance, settings.tilt_tolerance
         self.bounds = read_only([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, *tolerances, 1.0])
 
-    def _frames(self, model: pin.Model, flange_id: int, task: GraspTask) -> Attachments:
+    def _frames(self, tree: BatchModel, model: pin.Model, flange_id: int, task: GraspTask) -> Attachments:
         pads = (frames_named(model, name)[0] for name in task.gripper.pads)
         frames = [model.frames[i] for i in (flange_id, *pads)]
         (flange, T), *fingers = [(int(frame.parentJoint), pin.SE3(frame.placement)) for frame in frames]
         # The axes of the pinch are those of the hand; only its origin depends on the fingers.
-        return self.hand.attach([(flange, T * task.T_flange_open), *fingers])
-
-    def configurations(self, q: Array, q_h: Array) -> Array:
-        """Configurations of the tree for arm (n, M) and gripper (m, M) positions."""
-        both = np.empty((self.hand.parents.size, q.shape[1]))
-        both[self.arm_indices], both[self._hand_indices] = q, q_h
-        return both
+        return tree.attach([(flange, T * task.T_flange_open), *fingers])
 
     def worst_values(self, samples: PlanSamples, part: PartMotion, wall: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Evaluate all constraints.
@@ -108,27 +112,11 @@ class PlanModels:
             (12, 3), one of `ROWS` each: the worst value, its time (s) and joint, or −1 where there are no samples; (M,)
             samples between which and the next one a constraint could be broken.
         """
-        closing, lifted, last = samples.stops
-        times, bounds = samples.times, self.bounds
-        table, suspects = np.full((len(ROWS), 3), -1.0), np.zeros(last, dtype=np.bool_)
-        _limits(samples.arm, *self._arm_limits, times, table[:GRIPPER], suspects)
-        _limits(samples.gripper, *self._gripper_limits, times, table[GRIPPER:TORQUE], suspects)
-        torques = []
-        if lifted:
-            torques.append(self.empty.inverse_dynamics(*np.ascontiguousarray(samples.arm[:, :, :lifted]))[0])
-            both = self.configurations(samples.arm[0, :, :lifted], samples.gripper[0, :, :lifted])
-            poses = self.hand.poses(both, self.hand_frames)
-            _grasp_frame(
-                *poses, *part, *self.grasp_on_part, times, wall, *self._funnel, bounds, closing, table, suspects
-            )
-        if last > lifted:
-            torque, motion = self.loaded.inverse_dynamics(*np.ascontiguousarray(samples.arm[:, :, lifted:]))
-            torques.append(torque)
-            _hold(motion, *self._held, times, lifted, table[HOLD], suspects)
-        _torques(np.concatenate(torques, axis=1), self._torque, times, table[TORQUE], suspects)
-        # What follows the last sample of a phase is a join: no time passes there.
-        suspects[[stop - 1 for stop in samples.stops if stop]] = False
-        return table, suspects
+        return _worst_values(
+            samples.times, samples.arm, samples.gripper, samples.stops, wall, part, self.grasp_on_part,
+            self._limits, self._empty, self._loaded, self.hand,
+            self._held, self._funnel, self.bounds,
+        )  # fmt: skip
 
 
 @lru_cache(maxsize=8)
@@ -137,56 +125,87 @@ def plan_models(task: GraspTask, grasp_name: str) -> PlanModels:
     return PlanModels(task, grasp_name)
 
 
-def _boxes(lower: Array, upper: Array, velocity: Array, acceleration: Array) -> tuple[Array, Array, Array, Array]:
-    """Middle and half-width of the position range, limits of velocity and acceleration."""
-    return (
-        read_only((upper + lower) / 2), read_only((upper - lower) / 2), read_only(velocity), read_only(acceleration)
-    )  # fmt: skip
+def _boxes(lower: Array, upper: Array, velocity: Array, acceleration: Array) -> tuple[Array, Array]:
+    """Middles and half-widths (3, n) of the ranges of position, velocity and acceleration."""
+    zero = np.zeros_like(velocity)
+    return read_only([(upper + lower) / 2, zero, zero]), read_only([(upper - lower) / 2, velocity, acceleration])
 
 
 @njit(cache=True, error_model="numpy")
-def _limits(states, middle, half, velocity, acceleration, times, table, suspects):
-    """Positions, velocities and accelerations (3, n, M) as parts of their limits (n,)."""
-    _, n, samples = states.shape
-    share = np.empty((n, samples))
-    for i in range(n):
-        for k in range(samples):
-            share[i, k] = abs(states[0, i, k] - middle[i]) / half[i]
-    _judge(share, 0, 1.0, 1.0, times, table[0], suspects)
-    for i in range(n):
-        for k in range(samples):
-            share[i, k] = abs(states[1, i, k]) / velocity[i]
-    _judge(share, 0, 1.0, 1.0, times, table[1], suspects)
-    for i in range(n):
-        for k in range(samples):
-            share[i, k] = abs(states[2, i, k]) / acceleration[i]
-    # Between two grid points accelerations are linear: no worse than there.
-    _enter(share, 0, 1.0, times, table[2])
+def _worst_values(
+    times, arm, gripper, stops, wall, part, grasp_on_part, limits, empty, loaded, hand, held, funnel, bounds
+):
+    """See `PlanModels.worst_values`."""
+    closing, lifted, last = stops
+    table, suspects = np.full((len(ROWS), 3), -1.0), np.zeros(last, dtype=np.bool_)
+    torque = np.empty((arm.shape[1], last))
+    _limits(arm, *limits[0], times, table[:GRIPPER], suspects)
+    _limits(gripper, *limits[1], times, table[GRIPPER:TORQUE], suspects)
+    if lifted:
+        q, w, v = arm[0, :, :lifted].copy(), arm[1, :, :lifted].copy(), arm[2, :, :lifted].copy()
+        torque[:, :lifted] = newton_euler(*cosine_sine(q), w, v, *empty)[0]
+        arm_indices, hand_indices, tree, frames = hand
+        both = side_by_side(q, gripper[0, :, :lifted], arm_indices, hand_indices)
+        R, p = frame_poses(*cosine_sine(both), *tree, *frames)
+        _grasp_frame(R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects)
+    if last > lifted:
+        q, w, v = arm[0, :, lifted:].copy(), arm[1, :, lifted:].copy(), arm[2, :, lifted:].copy()
+        torque[:, lifted:], motion = newton_euler(*cosine_sine(q), w, v, *loaded)
+        _hold(motion, *held, times, lifted, table[HOLD], suspects)
+    share = _shares(torque, np.zeros(limits[2].size), limits[2])
+    _judge(share, 0, 1.0, 1.0, times, table[TORQUE], suspects)
+    # What follows the last sample of a phase is a join: no time passes there.
+    for stop in stops:
+        if stop > 0:
+            suspects[stop - 1] = False
+    return table, suspects
+
+
+@njit(cache=True)
+def side_by_side(q, q_h, arm_indices, hand_indices):
+    """Configurations (n + m, M) of the tree for arm (n, M) and gripper (m, M) positions."""
+    both = np.empty((arm_indices.size + hand_indices.size, q.shape[1]))
+    for i in range(arm_indices.size):
+        both[arm_indices[i]] = q[i]
+    for i in range(hand_indices.size):
+        both[hand_indices[i]] = q_h[i]
+    return both
 
 
 @njit(cache=True, error_model="numpy")
-def _torques(torques, limit, times, row, suspects):
-    """Torques (n, M) as parts of their limits (n,)."""
-    for i in range(torques.shape[0]):
-        for k in range(torques.shape[1]):
-            torques[i, k] = abs(torques[i, k]) / limit[i]
-    _judge(torques, 0, 1.0, 1.0, times, row, suspects)
+def _limits(states, middles, limits, times, table, suspects):
+    """Positions, velocities and accelerations (3, n, M), less their middles (3, n), as parts of their limits (3, n)."""
+    for kind in range(3):
+        share = _shares(states[kind], middles[kind], limits[kind])
+        if kind < 2:
+            _judge(share, 0, 1.0, 1.0, times, table[kind], suspects)
+        else:
+            # Between two grid points accelerations are linear: no worse than there.
+            _enter(share, 0, 1.0, times, table[kind])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _shares(values, middles, limits):
+    """Values (n, M) less their middles (n,) as parts of their limits (n,)."""
+    share = np.empty(values.shape)
+    for i in range(limits.size):
+        middle, inverse = middles[i], 1.0 / limits[i]
+        for k in range(values.shape[1]):
+            share[i, k] = abs(values[i, k] - middle) * inverse
+    return share
 
 
 @njit(cache=True, error_model="numpy")
 def _grasp_frame(
-    R, p, rotation, position, twist, arrival, R_part_grasp, p_part_grasp, times, wall, sigma_x, sigma_y, threshold,
-    bounds, closing, table, suspects,
-):  # fmt: skip
+    R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects
+):
     """What the hand (3, 3, 3, M), (3, 3, M) does above and at the grasp frame, in approach and grasp.
 
     In the approach h(q) of eq. (6), how high G is above the inverted Gaussian of eq. (5) times `wall`. In the grasp G
     stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes.
     """
-    samples = p.shape[2]
-    G, angle = hand_in_grasp_frame(
-        R, p, rotation, position, twist, arrival, R_part_grasp, p_part_grasp, times[:samples]
-    )
+    samples, (sigma_x, sigma_y, threshold) = p.shape[2], funnel
+    G, angle = hand_in_grasp_frame(R, p, *part, *grasp_on_part, times[:samples])
     height, above = np.empty((1, closing)), np.empty((1, samples - closing))
     aside, tilt = np.empty(above.shape), np.empty(above.shape)
     for s in range(closing):
