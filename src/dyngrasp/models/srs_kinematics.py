@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +16,13 @@ import pinocchio as pin
 
 from dyngrasp.errors import InvalidProblem, ModelFileError, OutOfReach
 from dyngrasp.models.srs_chain import BRANCHES, ElbowCircle, SrsChain, joint_vector
-from dyngrasp.models.srs_search import configurations_within, follow_configuration, nearest_configuration
-from dyngrasp.signals import Array, read_only
+from dyngrasp.models.srs_search import (
+    admissible_configurations,
+    configurations_within,
+    follow_configuration,
+    nearest_configuration,
+)
+from dyngrasp.signals import Array, frozen, read_only
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -187,11 +192,14 @@ class SrsKinematics:
             InvalidProblem: A pose that is not finite.
         """
         grid = _grid(arm_angles) if isinstance(arm_angles, int) else np.atleast_1d(np.asarray(arm_angles, dtype=float))
-        q, within = self._configurations(self._circle(T_world_flange), grid, _every_branch(grid.size))
-        at, branches = np.nonzero(within)
-        if at.size == 0:
+        circle, limits = self._circle(T_world_flange), self.limits
+        found = admissible_configurations(
+            circle.elbow, circle.rotations, grid, _every_branch(grid.size), self._middle, limits.position_lower,
+            limits.position_upper,
+        )  # fmt: skip
+        if len(found[0]) == 0:
             raise self._forbidden(grid.size)
-        return SrsSolutions(q[at, branches], grid[at], branches)
+        return SrsSolutions(*found)
 
     def solutions(self, T_world_flange: pin.SE3, *, count: int = ARM_ANGLES) -> Array:
         """`scan(T_world_flange, count).configurations`: (k, 7), k ≥ 1; raises as `scan` does."""
@@ -286,11 +294,15 @@ class SrsKinematics:
         )
 
 
+@lru_cache(maxsize=8)
 def _every_branch(count: int) -> NDArray[np.int64]:
     """All branches, (count, 8)."""
-    return np.broadcast_to(np.arange(BRANCHES), (count, BRANCHES)).copy()
+    branches = np.broadcast_to(np.arange(BRANCHES), (count, BRANCHES)).copy()
+    branches.setflags(write=False)
+    return branches
 
 
+@lru_cache(maxsize=8)
 def _grid(count: int) -> Array:
     # Symmetric about zero with zero on it, so that a grid laid about an angle contains that angle exactly.
-    return 2.0 * math.pi * (np.arange(count) - count // 2) / count
+    return frozen(2.0 * math.pi * (np.arange(count) - count // 2) / count)

@@ -11,6 +11,8 @@ from numba import njit
 from dyngrasp.models.srs_chain import ALIGNED, ROUNDING, arm_angle_of, circle_at, configurations
 
 _REFINED = 4  # local minima on the grid of arm angles that are looked into
+_FOUND = 1e-9  # how near to a minimum its search ends (rad)
+_GOLDEN = (3.0 - 5.0**0.5) / 2.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -18,7 +20,7 @@ def nearest_configuration(elbow, rotations, grid, step, branches, reference, wei
     """The configuration (7,) nearest to a reference, and its distance squared; inf if none on the grid is admissible.
 
     `branches` (m, b) are those tried at each angle of the grid (m,), a full turn in steps of `step` (rad).
-    The best local minima of the grid are searched on ever finer grids about the best angle so far.
+    The best local minima of the grid are searched by golden section.
     """
     q, within = configurations_within(elbow, rotations, grid, branches, middle, lower, upper)
     cost = _weighted_squares(q, within, reference, weight)
@@ -29,26 +31,28 @@ def nearest_configuration(elbow, rotations, grid, step, branches, reference, wei
             if cost[m, k] <= cost[m - 1, k] and cost[m, k] <= cost[(m + 1) % count, k]:
                 minima[m, k] = cost[m, k]
     best_q, best = np.empty(7), np.inf
-    offsets = np.linspace(-1.0, 1.0, 17)
-    branch = np.empty((offsets.size, 1), np.int64)
-    for flat in np.argsort(minima.ravel())[:_REFINED]:
-        m, k = flat // columns, flat % columns
+    psi, branch = np.empty(1), np.empty((1, 1), np.int64)
+    for _ in range(_REFINED):
+        at = minima.argmin()
+        m, k = at // columns, at % columns
         if not np.isfinite(minima[m, k]):
             break
-        width, angle, least, found = step, grid[m], cost[m, k], q[m, k].copy()
-        branch[:] = branches[m, k]
-        while width > 1e-9:
-            trial, within = configurations_within(
-                elbow, rotations, angle + width * offsets, branch, middle, lower, upper
-            )
-            costs = _weighted_squares(trial, within, reference, weight)[:, 0]
-            pick = costs.argmin()
-            if costs[pick] < least:
-                least, angle, found = costs[pick], angle + width * offsets[pick], trial[pick, 0].copy()
-            # Wider than the spacing of 1/8: noise near the minimum cannot push it out of the next window.
-            width /= 6.0
+        minima[m, k] = np.inf
+        left, angle, right = grid[m] - step, grid[m], grid[m] + step
+        branch[0, 0], least, found = branches[m, k], cost[m, k], q[m, k].copy()
+        while right - left > 2.0 * _FOUND:
+            longer = right - angle if right - angle > angle - left else left - angle
+            psi[0] = angle + _GOLDEN * longer
+            trial, within = configurations_within(elbow, rotations, psi, branch, middle, lower, upper)
+            now = _weighted_squares(trial, within, reference, weight)[0, 0]
+            # The better of the two stays in the middle; the other is the new end on its side.
+            if now < least:
+                ended, angle, least, found = angle, psi[0], now, trial[0, 0].copy()
+            else:
+                ended = psi[0]
+            left, right = (ended, right) if ended < angle else (left, ended)
             # By then all that is left to gain is far below this.
-            if width < 1e-3 and least > 1.05 * best + 1e-9:
+            if right - left < 2e-3 and least > 1.05 * best + 1e-9:
                 break
         if least < best:
             best, best_q = least, found
@@ -67,6 +71,20 @@ def follow_configuration(R, p, q_reference, lengths, nearest, farthest, middle, 
     q, within = configurations_within(elbow, rotations, psi, branch, middle, lower, upper)
     out[:] = q[0, 0]
     return within[0, 0]
+
+
+@njit(cache=True, error_model="numpy")
+def admissible_configurations(elbow, rotations, psi, branches, middle, lower, upper):
+    """Those of `configurations_within` that keep the limits, (k, 7), and the arm angle and the branch of each, (k,)."""
+    q, within = configurations_within(elbow, rotations, psi, branches, middle, lower, upper)
+    most, count = branches.size, 0
+    kept, angles, of_branch = np.empty((most, 7)), np.empty(most), np.empty(most, np.int64)
+    for m in range(branches.shape[0]):
+        for k in range(branches.shape[1]):
+            if within[m, k]:
+                kept[count], angles[count], of_branch[count] = q[m, k], psi[m], branches[m, k]
+                count += 1
+    return kept[:count], angles[:count], of_branch[:count]
 
 
 @njit(cache=True, error_model="numpy")
