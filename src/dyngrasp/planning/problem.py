@@ -9,12 +9,14 @@ from typing import NamedTuple, Protocol
 
 import casadi
 import numpy as np
+from numba import njit
 
 from dyngrasp.errors import InvalidProblem, PlanningFailed
 from dyngrasp.signals import Array, read_only
 from dyngrasp.trajectory import GraspPlan, Trajectory
 
 MIN_INTERVALS = 4  # two boundary states of two derivatives each leave no freedom on a coarser grid
+ROUNDING = 1e-9  # beyond its limits (rad, rad/s) that a boundary state may be
 
 
 class Status(StrEnum):
@@ -60,6 +62,16 @@ class NodeConstraint:
             raise InvalidProblem(f"{self.name}: {n_p} parameters a node expected, got {self.parameters.shape[1]}")
         if (self.lower > self.upper).any():
             raise InvalidProblem(f"{self.name}: a lower bound above its upper bound")
+
+
+@njit(cache=True)
+def _first_outside(position: Array, velocity: Array, lower: Array, upper: Array, speed: Array) -> int:
+    """The first joint whose state (n,) is not a finite one within its limits (n,), up to rounding; −1 if none is."""
+    for i in range(position.size):
+        inside = lower[i] - ROUNDING <= position[i] <= upper[i] + ROUNDING and abs(velocity[i]) <= speed[i] + ROUNDING
+        if not (inside and np.isfinite(position[i]) and np.isfinite(velocity[i])):
+            return i
+    return -1
 
 
 @dataclass(frozen=True)
@@ -132,24 +144,14 @@ class PhaseProblem:
                 )
             if constraint.function.size1_in(0) != n:
                 raise InvalidProblem(f"{self.name}: {constraint.name} is a function of another number of joints")
-        rounding = 1e-9
         for end in ("start", "end"):
             q, w = getattr(self, f"{end}_position"), getattr(self, f"{end}_velocity")
-            if not (np.isfinite(q).all() and np.isfinite(w).all()):
-                raise InvalidProblem(f"{self.name}: the {end} state is not finite")
-            outside = np.maximum(self.position_lower - q, q - self.position_upper)
-            if (outside > rounding).any():
-                i = int(outside.argmax())
+            i = _first_outside(q, w, self.position_lower, self.position_upper, self.velocity_limit)
+            if i >= 0:
                 raise InvalidProblem(
-                    f"{self.name}: {end} position of joint {i + 1} is {q[i]:.4f} rad, outside "
-                    f"[{self.position_lower[i]:.4f}, {self.position_upper[i]:.4f}]"
-                )
-            excess = np.abs(w) - self.velocity_limit
-            if (excess > rounding).any():
-                i = int(excess.argmax())
-                raise InvalidProblem(
-                    f"{self.name}: {end} velocity of joint {i + 1} is {w[i]:.4f} rad/s, "
-                    f"limit {self.velocity_limit[i]:.4f}"
+                    f"{self.name}: joint {i + 1} of the {end} state is at {q[i]:.4f} rad with {w[i]:.4f} rad/s, "
+                    f"possible are {self.position_lower[i]:.4f} to {self.position_upper[i]:.4f} rad with up to "
+                    f"{self.velocity_limit[i]:.4f} rad/s"
                 )
 
     @property
