@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 from dyngrasp.models.catalogue import load_robot
+from dyngrasp.models.flange_chain import FlangeChain
 from dyngrasp.models.robot import RobotModel
 
 RNG = np.random.default_rng(3)
@@ -72,3 +73,26 @@ def test_newton_steps_from_a_singular_posture_are_finite(robot):
     straight = np.zeros(robot.n)
     assert np.isfinite(robot.flange_chain.moved_to(pin.SE3.Identity(), straight, 3, 1e-6)).all()
     np.testing.assert_array_equal(straight, 0.0)
+
+
+def test_dexterity_is_the_least_singular_value(robot):
+    for q in postures(robot, 100):
+        least = np.linalg.svd(robot.jacobian(q), compute_uv=False)[-1]
+        assert robot.flange_chain.is_dexterous(q, least * (1 - 1e-6))
+        assert not robot.flange_chain.is_dexterous(q, least * (1 + 1e-6))
+    assert not robot.flange_chain.is_dexterous(np.full(robot.n, np.nan), 0.0)
+
+
+def test_dexterity_of_fewer_joints_than_six_is_that_of_the_directions_they_have(robot):
+    chain = FlangeChain(robot.flange_chain.rotations[-5:], robot.flange_chain.offsets[-5:])
+    q, J = np.array([0.3, 0.8, -0.5, 0.4]), np.empty((6, 4))
+    for i in range(4):
+        step = np.zeros(4)
+        step[i] = 1e-6
+        after, before = chain.pose(q + step), chain.pose(q - step)
+        J[:3, i] = (after.translation - before.translation) / 2e-6
+        J[3:, i] = pin.log3(after.rotation @ before.rotation.T) / 2e-6
+    least = np.linalg.svd(J, compute_uv=False)[-1]
+    # Central differences of this step are good to nine digits or so.
+    assert chain.is_dexterous(q, least * (1 - 1e-6))
+    assert not chain.is_dexterous(q, least * (1 + 1e-6))

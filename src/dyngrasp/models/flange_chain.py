@@ -61,6 +61,10 @@ class FlangeChain:
         missing = least_rates(self.rotations, self.offsets, q, twist_world, rates) if q.size >= 6 else -1.0
         return (rates, missing) if missing >= 0.0 else None
 
+    def is_dexterous(self, q: Array, least: float) -> bool:
+        """Whether all min(6, n) singular values of the Jacobian at q (n,) are at least so large (translation in m)."""
+        return is_dexterous(self.rotations, self.offsets, q, least)
+
     def moved_to(self, T_world_flange: pin.SE3, q: Array, steps: int, damping: float) -> Array:
         """The configuration (n,) that Newton steps of least length lead to from q (n,), towards a pose of the flange.
 
@@ -112,20 +116,64 @@ def _jacobian(frames, J):
 
 
 @njit(cache=True, error_model="numpy")
+def _factor(J, shift, L):
+    """Write the Cholesky factor L (m, m) of J Jᵀ + shift; whether that is positive definite."""
+    for i in range(len(J)):
+        for j in range(i + 1):
+            rest = shift if i == j else 0.0
+            for k in range(J.shape[1]):
+                rest += J[i, k] * J[j, k]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = rest / L[j, j]
+            elif rest > 0.0:
+                L[i, i] = np.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def is_dexterous(rotations, offsets, q, least):
+    """`FlangeChain.is_dexterous`: no square of a singular value is less than that of the least."""
+    frames, J = np.empty((q.size + 1, 3, 4)), np.empty((6, q.size))
+    place_frames(rotations, offsets, q, frames)
+    _jacobian(frames, J)
+    rows = J if q.size >= 6 else J.T.copy()
+    return _factor(rows, -(least**2), np.empty((len(rows), len(rows))))
+
+
+@njit(cache=True, error_model="numpy")
 def _move_to(rotations, offsets, R, p, steps, damping, q):
     """`FlangeChain.moved_to` in place."""
-    frames, J, twist = np.empty((q.size + 1, 3, 4)), np.empty((6, q.size)), np.empty(6)
+    frames, J, L, y = np.empty((q.size + 1, 3, 4)), np.empty((6, q.size)), np.empty((6, 6)), np.empty(6)
     for _ in range(steps):
         place_frames(rotations, offsets, q, frames)
         _jacobian(frames, J)
-        twist[:3] = p - frames[-1, :, 3]
-        turn = R @ frames[-1, :, :3].copy().T
+        now = frames[-1]
         for i in range(3):
-            twist[3 + i] = (turn[i - 1, i - 2] - turn[i - 2, i - 1]) / 2
-        sine = np.sqrt((twist[3:] ** 2).sum())
+            y[i] = p[i] - now[i, 3]
+            # The axis of the turn R nowᵀ that is left, times the sine of its angle.
+            before, after = (i + 2) % 3, (i + 1) % 3
+            y[3 + i] = 0.0
+            for k in range(3):
+                y[3 + i] += (R[before, k] * now[after, k] - R[after, k] * now[before, k]) / 2
+        sine, trace = np.sqrt((y[3:] ** 2).sum()), (R * now[:, :3]).sum()
         if sine > 0.0:
-            twist[3:] *= np.arctan2(sine, (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0) / 2) / sine
-        q += J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), twist)
+            y[3:] *= np.arctan2(sine, (trace - 1.0) / 2) / sine
+        if not _factor(J, damping, L):
+            break
+        for i in range(6):
+            for k in range(i):
+                y[i] -= L[i, k] * y[k]
+            y[i] /= L[i, i]
+        for i in range(5, -1, -1):
+            for k in range(i + 1, 6):
+                y[i] -= L[k, i] * y[k]
+            y[i] /= L[i, i]
+        for i in range(6):
+            q += y[i] * J[i]
 
 
 @njit(cache=True, error_model="numpy")

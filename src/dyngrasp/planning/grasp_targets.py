@@ -142,7 +142,7 @@ def ranked_grasp_targets(T_world_object: pin.SE3, task: GraspTask, q_start: Arra
         if any(np.abs(q - other).max() < _DISTINCT for other in yielded):
             continue
         # Asked only of those that are wanted: it costs more than the rest of the choice.
-        if np.linalg.svd(task.robot.jacobian(q), compute_uv=False)[-1] < task.settings.dexterity_min:
+        if not task.robot.flange_chain.is_dexterous(q, task.settings.dexterity_min):
             continue
         try:
             targets = _targets_at(q, grasp, T_world_object, task, q_start)
