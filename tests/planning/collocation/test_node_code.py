@@ -7,6 +7,7 @@ import pytest
 from dyngrasp.planning.collocation import code_cache, node_code
 from dyngrasp.planning.collocation.code_cache import CompilationError
 from dyngrasp.planning.collocation.node_functions import CompiledNodeFunctions, InterpretedNodeFunctions
+from dyngrasp.planning.collocation.work_arrays import padded
 
 pytestmark = pytest.mark.skipif(code_cache.compiler() is None, reason="no C compiler")
 
@@ -37,14 +38,15 @@ def test_every_operation_on_full_and_partial_groups(points):
     random = np.random.default_rng(points)
     q, v, p = (random.uniform(-1.5, 1.5, (points, 2)) for _ in range(3))
     rows = function.size1_out(0)
-    weights = random.normal(size=(points, rows))
+    room = padded(points)
+    weights = random.normal(size=(rows, room))
     found = []
     for functions in (CompiledNodeFunctions(function, "all"), InterpretedNodeFunctions(function)):
         values, g = np.empty((points, rows)), np.empty((points, rows))
-        jacobian, hessian = np.full((points, rows, 4), 3.0), np.zeros((points, 4, 4))
+        jacobian, hessian = np.full((rows, 4, room), 3.0), np.zeros((4, 4, room))
         functions.values(q, v, p, values, 0)
         functions.derivatives(q, v, p, weights, g, jacobian, hessian, 0)
-        found.append((values, g, jacobian, hessian))
+        found.append((values, g, jacobian[:, :, :points], hessian[:, :, :points]))
     for fast, slow in zip(*found, strict=True):
         np.testing.assert_allclose(fast, slow, rtol=1e-12, atol=1e-12)
 
@@ -53,8 +55,9 @@ def test_rows_that_depend_on_nothing():
     symbols = [ca.SX.sym(name, n) for name, n in (("q", 2), ("v", 2), ("p", 0))]
     function = ca.Function("constant", symbols, [ca.SX(1.5)])
     functions = CompiledNodeFunctions(function, "constant")
-    g, jacobian, hessian = np.empty((3, 1)), np.ones((3, 1, 4)), np.zeros((3, 4, 4))
-    functions.derivatives(np.ones((3, 2)), np.ones((3, 2)), np.empty((3, 0)), np.ones((3, 1)), g, jacobian, hessian, 0)
+    g, jacobian, hessian = np.empty((3, 1)), np.ones((1, 4, padded(3))), np.zeros((4, 4, padded(3)))
+    weights = np.ones((1, padded(3)))
+    functions.derivatives(np.ones((3, 2)), np.ones((3, 2)), np.empty((3, 0)), weights, g, jacobian, hessian, 0)
     assert (g == 1.5).all()
     assert (jacobian == 0.0).all()
     assert (hessian == 0.0).all()
@@ -73,7 +76,7 @@ def test_sine_and_cosine_are_exact_to_the_last_digits():
     close = np.arange(-2000, 2000) * (np.pi / 2) + random.choice([0.0, 1e-15, 1e-9, -1e-5], 4000)
     long = np.power(10.0, random.uniform(-12, 9, 4000)) * random.choice([-1.0, 1.0], 4000)
     edges = np.array([0.0, 2.0**20, np.nextafter(2.0**20, np.inf), -(2.0**20), np.pi / 4, np.nan, np.inf, -np.inf])
-    x = np.concatenate([ordinary, close, long, edges])
+    x = np.concatenate([ordinary, close, long, edges]).astype(float)
     symbols = [ca.SX.sym("q", 1), ca.SX.sym("v", 1), ca.SX.sym("p", 0)]
     function = ca.Function("turn", symbols, [ca.vertcat(ca.sin(symbols[0]), ca.cos(symbols[0]))])
     g = np.empty((x.size, 2))

@@ -15,6 +15,7 @@ from dyngrasp.planning import constraints
 from dyngrasp.planning.collocation import code_cache, node_functions
 from dyngrasp.planning.collocation.code_cache import COMPILER_VARIABLE, CompilationError
 from dyngrasp.planning.collocation.node_functions import CompiledNodeFunctions, InterpretedNodeFunctions
+from dyngrasp.planning.collocation.work_arrays import padded
 
 SOURCE = "double answer(double x) { return 2 * x + %d; }\n"
 K = 5
@@ -42,12 +43,13 @@ def torque(iiwa):
 def evaluate(functions, constraint, seed=0, column=2, total=11):
     """Values and derivatives in the middle of wider arrays, as beside other constraints."""
     random = np.random.default_rng(seed)
-    q, v, weights = (random.normal(size=(K, n)) for n in (7, 7, total))
+    q, v = random.normal(size=(2, K, 7))
+    weights = random.normal(size=(total, padded(K)))
     values, g = np.full((K, total), 7.0), np.full((K, total), 7.0)
-    jacobian, hessian = np.full((K, total, 14), 7.0), np.ones((K, 14, 14))
+    jacobian, hessian = np.full((total, 14, padded(K)), 7.0), np.ones((14, 14, padded(K)))
     functions.values(q, v, constraint.parameters, values, column)
     functions.derivatives(q, v, constraint.parameters, weights, g, jacobian, hessian, column)
-    return values, g, jacobian, hessian
+    return values, g, jacobian[:, :, :K], hessian[:, :, :K]
 
 
 def test_compiled_and_interpreted_agree(needs_compiler, torque):
@@ -60,23 +62,23 @@ def test_compiled_and_interpreted_agree(needs_compiler, torque):
     np.testing.assert_allclose(values, g, rtol=1e-12, atol=1e-12)
     assert (values[:, :2] == 7.0).all()
     assert (values[:, 9:] == 7.0).all()
-    assert (jacobian[:, :2] == 7.0).all()
-    assert (jacobian[:, 9:] == 7.0).all()
-    np.testing.assert_allclose(hessian, hessian.transpose(0, 2, 1), atol=1e-12 * np.abs(hessian).max())
+    assert (jacobian[:2] == 7.0).all()
+    assert (jacobian[9:] == 7.0).all()
+    np.testing.assert_allclose(hessian, hessian.transpose(1, 0, 2), atol=1e-12 * np.abs(hessian).max())
 
 
 @pytest.mark.parametrize("kind", [CompiledNodeFunctions, InterpretedNodeFunctions])
 def test_derivatives_are_those_of_the_values(needs_compiler, torque, kind):
     functions = kind(torque.function, "torque") if kind is CompiledNodeFunctions else kind(torque.function)
     random = np.random.default_rng(3)
-    u, weights = random.normal(size=(K, 14)), random.normal(size=(K, 7))
+    u, weights = random.normal(size=(K, 14)), random.normal(size=(7, padded(K)))
     p, step = torque.parameters, 1e-6
 
     def at(u):
-        g, jacobian, hessian = np.empty((K, 7)), np.empty((K, 7, 14)), np.zeros((K, 14, 14))
+        g, jacobian, hessian = np.empty((K, 7)), np.empty((7, 14, padded(K))), np.zeros((14, 14, padded(K)))
         q, v = np.ascontiguousarray(u[:, :7]), np.ascontiguousarray(u[:, 7:])
         functions.derivatives(q, v, p, weights, g, jacobian, hessian, 0)
-        return g, jacobian, hessian
+        return g, jacobian[:, :, :K], hessian[:, :, :K]
 
     _, jacobian, hessian = at(u)
     for j in range(14):
@@ -84,9 +86,9 @@ def test_derivatives_are_those_of_the_values(needs_compiler, torque, kind):
         up[:, j] += step
         down[:, j] -= step
         (g_up, J_up, _), (g_down, J_down, _) = at(up), at(down)
-        np.testing.assert_allclose(jacobian[:, :, j], (g_up - g_down) / (2 * step), atol=1e-6)
-        by_j = np.einsum("km,kmi->ki", weights, (J_up - J_down) / (2 * step))
-        np.testing.assert_allclose(hessian[:, j], by_j, atol=1e-5)
+        np.testing.assert_allclose(jacobian[:, j].T, (g_up - g_down) / (2 * step), atol=1e-6)
+        by_j = np.einsum("mk,mik->ik", weights[:, :K], (J_up - J_down) / (2 * step))
+        np.testing.assert_allclose(hessian[j], by_j, atol=1e-5)
 
 
 def test_which_rows_depend_on_the_acceleration():

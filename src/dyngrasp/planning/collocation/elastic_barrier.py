@@ -102,7 +102,7 @@ def longest_steps(
     return primal, dual
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def complementarity(
     s: Array,
     t: Array,
@@ -181,12 +181,12 @@ def barrier(s: Array, t: Array, price: float, mu: float) -> float:
     return cost - mu * (logarithms + np.log(product))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def barrier_slope(s: Array, t: Array, ds: Array, dt: Array, price: float, mu: float) -> float:
     """Derivative of `barrier` along ds, dt."""
     slope = 0.0
     for i in range(s.size):
-        slope += price * dt[i] - mu * (ds[i] / s[i] + dt[i] / t[i])
+        slope += price * dt[i] - mu * (ds[i] * t[i] + dt[i] * s[i]) / (s[i] * t[i])
     return slope
 
 

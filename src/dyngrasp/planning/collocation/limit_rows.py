@@ -210,16 +210,30 @@ def row_steps(dz: Array, dT: float, T: float, v: Array, jacobian: Array, limits:
         dT: Change of T.
         T: Where the rows are linearised (s).
         v: (K, n) accelerations there, a / T².
-        jacobian: (K, m, 2n) of the constraints' rows by q and v.
+        jacobian: (m, 2n, P) of the constraints' rows by q and v.
         limits: `LimitRows.arguments`.
         dg: (K · R + 2,), overwritten.
     """
     _, half_width, velocity, acceleration, lo, up, _, _, scale, free, _, longest, fixed = limits
     _, K, n = dz.shape
-    boxes, m = velocity.size, jacobian.shape[1]
+    boxes, (m, _, P) = velocity.size, jacobian.shape
     R = (dg.size - 2) // K
-    dc = np.empty(m)
-    du = np.empty(2 * n)
+    du = np.zeros((2 * n, P))
+    for k in range(K):
+        for j in range(n):
+            du[j, k] = dz[POSITION, k, j]
+            du[n + j, k] = dz[CURVATURE, k, j] / (T * T) - 2.0 / T * v[k, j] * dT
+    dc = np.zeros((m, P))
+    for r in range(m):
+        change = dc[r]
+        for j in range(2 * n):
+            slope, du_j = jacobian[r, j], du[j]
+            for k in range(P):
+                change[k] += slope[k] * du_j[k]
+        for k in range(P):
+            change[k] *= scale[r]
+        if free[r] == 0.0:
+            change[0], change[K - 1] = 0.0, 0.0
     for k in range(K):
         end = k == 0 or k == K - 1
         at = k * R
@@ -237,49 +251,38 @@ def row_steps(dz: Array, dT: float, T: float, v: Array, jacobian: Array, limits:
             dg[at + j] = 2 * T * dT + a
             dg[at + n + j] = 2 * T * dT - a
         at += 2 * acceleration.size
-        for j in range(n):
-            du[j] = dz[POSITION, k, j]
-            du[n + j] = dz[CURVATURE, k, j] / (T * T) - 2.0 / T * v[k, j] * dT
-        for i in range(m):
-            change = 0.0
-            if not (end and free[i] == 0.0):
-                for j in range(2 * n):
-                    change += jacobian[k, i, j] * du[j]
-            dc[i] = change * scale[i]
         for i in range(lo.size):
-            dg[at + i] = dc[lo[i]]
+            dg[at + i] = dc[lo[i], k]
         at += lo.size
         for i in range(up.size):
-            dg[at + i] = -dc[up[i]]
+            dg[at + i] = -dc[up[i], k]
     dg[-2] = 0.0 if fixed else dT / longest
     dg[-1] = 0.0 if fixed else -dT / longest
 
 
 @njit(cache=True, error_model="numpy")
-def constraint_weights(y: Array, limits: tuple, weights: Array) -> None:
+def constraint_weights(y: Array, points: int, limits: tuple, weights: Array) -> None:
     """Write the factor of every constraint's row c in Σ y g: (y of its lower side − y of its upper side) / scale.
 
     Args:
         y: (K · R + 2,) factors of the one-sided rows.
+        points: K.
         limits: `LimitRows.arguments`.
-        weights: (K, m), overwritten; zero for rows that are constant at an end.
+        weights: (m, P), overwritten; zero for rows that are constant at an end.
     """
     _, _, velocity, acceleration, lo, up, _, _, scale, free, _, _, _ = limits
-    K, m = weights.shape
-    R = (y.size - 2) // K
-    for k in range(K):
-        end = k == 0 or k == K - 1
+    R = (y.size - 2) // points
+    weights[:] = 0.0
+    for k in range(points):
         at = k * R + 4 * velocity.size + 2 * acceleration.size
-        for i in range(m):
-            weights[k, i] = 0.0
         for i in range(lo.size):
-            weights[k, lo[i]] += y[at + i] * scale[lo[i]]
+            weights[lo[i], k] += y[at + i] * scale[lo[i]]
         at += lo.size
         for i in range(up.size):
-            weights[k, up[i]] -= y[at + i] * scale[up[i]]
-        if end:
-            for i in range(m):
-                weights[k, i] *= free[i]
+            weights[up[i], k] -= y[at + i] * scale[up[i]]
+    for i in range(weights.shape[0]):
+        weights[i, 0] *= free[i]
+        weights[i, points - 1] *= free[i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -290,17 +293,23 @@ def rows_transposed(y: Array, T: float, v: Array, jacobian: Array, limits: tuple
         y: (K · R + 2,) factors of the rows.
         T: As for `row_steps`, and so are the next three.
         v: (K, n)
-        jacobian: (K, m, 2n)
+        jacobian: (m, 2n, P)
         limits: `LimitRows.arguments`.
-        weights: (K, m) from `constraint_weights` of the same y.
+        weights: (m, P) from `constraint_weights` of the same y.
         dual: (3, K, n), added to.
     """
     _, half_width, velocity, acceleration, _, _, _, _, _, _, _, longest, fixed = limits
     _, K, n = dual.shape
-    boxes, m = velocity.size, jacobian.shape[1]
+    boxes, (m, _, P) = velocity.size, jacobian.shape
     R = (y.size - 2) // K
+    by_u = np.zeros((2 * n, P))
+    for j in range(2 * n):
+        sum_j = by_u[j]
+        for r in range(m):
+            weight, slope = weights[r], jacobian[r, j]
+            for k in range(P):
+                sum_j[k] += weight[k] * slope[k]
     by_T = 0.0
-    by_u = np.empty(2 * n)
     for k in range(K):
         at = k * R
         if 0 < k < K - 1:
@@ -312,15 +321,10 @@ def rows_transposed(y: Array, T: float, v: Array, jacobian: Array, limits: tuple
         for j in range(acceleration.size):
             dual[CURVATURE, k, j] += (y[at + j] - y[at + n + j]) / acceleration[j]
             by_T += 2 * T * (y[at + j] + y[at + n + j])
-        for j in range(2 * n):
-            by_u[j] = 0.0
-        for i in range(m):
-            for j in range(2 * n):
-                by_u[j] += weights[k, i] * jacobian[k, i, j]
         for j in range(n):
-            dual[POSITION, k, j] += by_u[j]
-            dual[CURVATURE, k, j] += by_u[n + j] / (T * T)
-            by_T -= 2.0 / T * v[k, j] * by_u[n + j]
+            dual[POSITION, k, j] += by_u[j, k]
+            dual[CURVATURE, k, j] += by_u[n + j, k] / (T * T)
+            by_T -= 2.0 / T * v[k, j] * by_u[n + j, k]
     if not fixed:
         by_T += (y[y.size - 2] - y[y.size - 1]) / longest
     return float(by_T)

@@ -2,7 +2,8 @@
 
 At one grid point everything depends on u = (q, v) through the constraints' rows and on q, w, a and T through boxes and
 objective. With v = a / T² the chain rule takes second derivatives by (q, v) to those by (q, a, T); the three-tap filter
-takes them to the unknowns x.
+takes them to the unknowns x. Every entry is computed for all grid points at once: the last axis of an array is theirs
+wherever its length is P.
 """
 
 from __future__ import annotations
@@ -62,9 +63,8 @@ def assemble(
     factor: float,
     curvature: float,
     shift: float,
-    column: Array,
 ) -> float:
-    """Write the band in `work` and the column of T; return the corner.
+    """Write the band and the column of T in `work`; return the corner.
 
     Args:
         work: The present point with the derivatives of the rows.
@@ -77,136 +77,201 @@ def assemble(
         factor: Weight of the objective, 1, or 0 where only the violation counts.
         curvature: Part of the second derivatives of the rows to take, 1, or 0 for Gauss and Newton's matrix.
         shift: Multiple of the identity added to the second derivatives by a: the inertia correction.
-        column: ((K−2) n,), overwritten.
     """
-    z, v, weights, jacobian, hessian, band = work.z, work.v, work.weights, work.jacobian, work.hessian, work.band
-    first, taps, _, slope = tap
-    _, half_width, velocity, acceleration, lo, up, _, _, scale, free, _, longest, fixed = limits
+    _, half_width, velocity, acceleration, _, _, _, _, _, _, _, longest, fixed = limits
+    qq, aq, aa = work.blocks[0], work.blocks[1], work.blocks[2]
+    z, v = work.z, work.v
     _, K, n = z.shape
-    m = jacobian.shape[1]
     R = (omega.size - 2) // K
     T2 = T * T
-    per_T2 = 1.0 / T2
     effort = factor * rho / (K - 1) / (T2 * T)
-    band[:] = 0.0
-    column[:] = 0.0
     corner = 0.0 if fixed else (omega[omega.size - 2] + omega[omega.size - 1]) / longest**2
 
-    width = (n + 7) // 8 * 8
-    qq, qa, aq, aa = np.zeros((n, width)), np.zeros((n, width)), np.zeros((n, width)), np.zeros((n, width))
-    by_q, by_a = np.zeros(width), np.zeros(width)
-    run = np.empty((n, TAPS * n))
-    ww = np.empty(n)
-    qT, wT, aT = np.empty(n), np.empty(n), np.empty(n)
-    row_stiffness = np.empty(m)
-    by_v = np.empty(n)
-
-    for k in range(K):
-        end = k == 0 or k == K - 1
-        at = k * R
-        boxes = at + 4 * velocity.size + 2 * acceleration.size
-
-        for i in range(m):
-            row_stiffness[i] = 0.0
-        for i in range(lo.size):
-            row_stiffness[lo[i]] += omega[boxes + i]
-        for i in range(up.size):
-            row_stiffness[up[i]] += omega[boxes + lo.size + i]
+    by_v = _constraint_blocks(work, limits, omega, curvature)
+    # Chain rule to (q, a, T): v = a / T², ∂v/∂T = −2 v / T.
+    by_T = np.zeros((3, n, qq.shape[2]))
+    qT, wT, aT = by_T[0], by_T[1], by_T[2]
+    ww = np.zeros((n, K))
+    _times_rates(aq, aa, v, T, qT, aT)
+    for i in range(n):
         for j in range(n):
-            by_v[j] = 0.0
-        # Blocks by (q, v): qq, aq and aa; qa is the transpose of aq.
-        for i in range(n):
-            for j in range(n):
-                qq[i, j] = -curvature * hessian[k, i, j]
-                aq[i, j] = -curvature * hessian[k, n + i, j]
-                aa[i, j] = -curvature * hessian[k, n + i, n + j]
-        for r in range(m):
-            if free[r] == 0.0 and end:
-                continue
-            stiff = row_stiffness[r] * scale[r] * scale[r]
-            for j in range(n):
-                by_q[j] = jacobian[k, r, j]
-            for i in range(n):
-                here = stiff * by_q[i]
-                for j in range(width):
-                    qq[i, j] += here * by_q[j]
-            if free[r] == 0.0:
-                continue
-            for j in range(n):
-                by_a[j] = jacobian[k, r, n + j]
-            for i in range(n):
-                here = stiff * by_a[i]
-                for j in range(width):
-                    aq[i, j] += here * by_q[j]
-                    aa[i, j] += here * by_a[j]
-            for j in range(n):
-                by_v[j] += curvature * weights[k, r] * by_a[j]
-        # Chain rule to (q, a, T): v = a / T², ∂v/∂T = −2 v / T.
-        for i in range(n):
-            qT[i], aT[i] = 0.0, 0.0
-        for i in range(n):
-            dv = -2.0 / T * v[k, i]
-            for j in range(n):
-                qT[j] += aq[i, j] * dv
-                aT[j] += aa[i, j] * dv
-        for i in range(n):
-            for j in range(n):
-                aq[i, j] *= per_T2
-                aa[i, j] *= per_T2 * per_T2
-                qa[j, i] = aq[i, j]
-        for i in range(n):
+            cross, square = aq[i, j], aa[i, j]
+            for k in range(cross.size):
+                cross[k] /= T2
+                square[k] /= T2 * T2
+        for k in range(K):
             # Second derivatives of v times the rows' multipliers enter with the sign of −λ g.
-            corner += aT[i] * (-2.0 / T * v[k, i]) - 6.0 / T2 * by_v[i] * v[k, i]
             a = z[CURVATURE, k, i]
-            aT[i] = aT[i] / T2 + 2.0 / (T2 * T) * by_v[i] - 6.0 * effort / T * a
-            aa[i, i] += 2.0 * effort + shift
-            corner += 12.0 * effort / T2 * a * a
-            if end or velocity.size == 0:
-                ww[i], wT[i] = 0.0, 0.0
-                continue
-            qq[i, i] += (omega[at + i] + omega[at + n + i]) / half_width[i] ** 2
+            corner += aT[i, k] * (-2.0 / T * v[k, i]) - 6.0 / T2 * by_v[i, k] * v[k, i] + 12.0 * effort / T2 * a * a
+            aT[i, k] = aT[i, k] / T2 + 2.0 / (T2 * T) * by_v[i, k] - 6.0 * effort / T * a
+            aa[i, i, k] += 2.0 * effort + shift
+    for k in range(1, K - 1):
+        at = k * R
+        for i in range(velocity.size):
+            qq[i, i, k] += (omega[at + i] + omega[at + n + i]) / half_width[i] ** 2
             plus, minus = omega[at + 2 * n + i], omega[at + 3 * n + i]
-            ww[i] = (plus + minus) / velocity[i] ** 2
-            wT[i] = (plus - minus) / velocity[i]
+            ww[i, k] = (plus + minus) / velocity[i] ** 2
+            wT[i, k] = (plus - minus) / velocity[i]
             corner += plus + minus
+    for k in range(K):
+        at = k * R + 4 * velocity.size
         for i in range(acceleration.size):
-            plus, minus = omega[at + 4 * n + i], omega[at + 5 * n + i]
-            aa[i, i] += (plus + minus) / acceleration[i] ** 2
-            aT[i] += 2.0 * T * (plus - minus) / acceleration[i]
+            plus, minus = omega[at + i], omega[at + n + i]
+            aa[i, i, k] += (plus + minus) / acceleration[i] ** 2
+            aT[i, k] += 2.0 * T * (plus - minus) / acceleration[i]
             corner += 4.0 * T2 * (plus + minus)
-            corner -= curvature * 2.0 * (multiplier[at + 4 * n + i] + multiplier[at + 5 * n + i])
-
+            corner -= curvature * 2.0 * (multiplier[at + i] + multiplier[at + n + i])
+    for k in range(K):
         if k <= 2 or k >= K - 3:
-            # Near the ends q, w and a depend on T themselves.
-            for i in range(n):
-                q, w, a = slope[POSITION, k, i], slope[RATE, k, i], slope[CURVATURE, k, i]
-                corner += 2.0 * (q * qT[i] + w * wT[i] + a * aT[i]) + w * w * ww[i]
-                for j in range(n):
-                    q_j, a_j = slope[POSITION, k, j], slope[CURVATURE, k, j]
-                    corner += q * (qq[i, j] * q_j + 2.0 * qa[i, j] * a_j) + a * aa[i, j] * a_j
-            for i in range(n):
-                wT[i] += ww[i] * slope[RATE, k, i]
-                for j in range(n):
-                    qT[i] += qq[i, j] * slope[POSITION, k, j] + qa[i, j] * slope[CURVATURE, k, j]
-                    aT[i] += aq[i, j] * slope[POSITION, k, j] + aa[i, j] * slope[CURVATURE, k, j]
-
-        for b in range(TAPS):
-            q_b, w_b, a_b = taps[k, b, POSITION], taps[k, b, RATE], taps[k, b, CURVATURE]
-            col = (first[k] + b) * n
-            for i in range(n):
-                column[col + i] += q_b * qT[i] + w_b * wT[i] + a_b * aT[i]
-            # Blocks on and below the diagonal in the columns of unknown b, side by side and transposed: the part of
-            # column j from the diagonal down is then one run of band[col + j]. qq and aa are symmetric, qa and aq each
-            # other's transpose.
-            blocks = TAPS - b
-            for e in range(blocks):
-                q_e, w_e, a_e = taps[k, b + e, POSITION], taps[k, b + e, RATE], taps[k, b + e, CURVATURE]
-                cqq, cqa, caq, caa = q_e * q_b, q_e * a_b, a_e * q_b, a_e * a_b
-                for j in range(n):
-                    for i in range(n):
-                        run[j, e * n + i] = cqq * qq[j, i] + cqa * aq[j, i] + caq * qa[j, i] + caa * aa[j, i]
-                    run[j, e * n + j] += w_e * w_b * ww[j]
-            for j in range(n):
-                for d in range(blocks * n - j):
-                    band[col + j, d] += run[j, j + d]
+            corner += _with_duration(work.blocks, ww, tap.slope, by_T, k)
+    _border(tap, by_T, work.border)
+    _band(tap, work.blocks, ww, work.band)
     return float(corner)
+
+
+@njit(cache=True, error_model="numpy")
+def _constraint_blocks(work: WorkArrays, limits: tuple, omega: Array, curvature: float) -> Array:
+    """Write what the constraints' rows add by (q, q), (v, q) and (v, v); return Σ weights ∂c/∂v (n, P).
+
+    The blocks by (q, q) and (v, v) are symmetric: the lower triangle is computed.
+    """
+    _, _, velocity, acceleration, lo, up, _, _, scale, free, _, _, _ = limits
+    jacobian, hessian, weights = work.jacobian, work.hessian, work.weights
+    qq, aq, aa = work.blocks[0], work.blocks[1], work.blocks[2]
+    m, twice, P = jacobian.shape
+    n, K = twice // 2, work.v.shape[0]
+    R = (omega.size - 2) // K
+    stiffness, stiff = np.zeros((m, P)), np.empty((m, twice, P))
+    for k in range(K):
+        at = k * R + 4 * velocity.size + 2 * acceleration.size
+        for i in range(lo.size):
+            stiffness[lo[i], k] += omega[at + i]
+        at += lo.size
+        for i in range(up.size):
+            stiffness[up[i], k] += omega[at + i]
+    for r in range(m):
+        if free[r] == 0.0:
+            stiffness[r, 0], stiffness[r, K - 1] = 0.0, 0.0
+        for i in range(twice):
+            factor, slope, product = stiffness[r], jacobian[r, i], stiff[r, i]
+            for k in range(P):
+                product[k] = scale[r] * scale[r] * factor[k] * slope[k]
+    for i in range(twice):
+        for j in range(i + 1):
+            if i < n:
+                block = qq[i, j]
+            elif j < n:
+                block = aq[i - n, j]
+            else:
+                block = aa[i - n, j - n]
+            second = hessian[i, j]
+            for k in range(P):
+                block[k] = -curvature * second[k]
+            for r in range(m):
+                if i >= n and free[r] == 0.0:
+                    continue
+                left, right = stiff[r, i], jacobian[r, j]
+                for k in range(P):
+                    block[k] += left[k] * right[k]
+            if i < n:
+                qq[j, i] = block
+            elif j >= n:
+                aa[j - n, i - n] = block
+    by_v = np.zeros((n, P))
+    for r in range(m):
+        if free[r] == 0.0:
+            continue
+        for j in range(n):
+            total, weight, slope = by_v[j], weights[r], jacobian[r, n + j]
+            for k in range(P):
+                total[k] += curvature * weight[k] * slope[k]
+    return by_v
+
+
+@njit(cache=True, error_model="numpy")
+def _times_rates(aq: Array, aa: Array, v: Array, T: float, qT: Array, aT: Array) -> None:
+    """Add the blocks times ∂v/∂T, the mixed derivatives by q or v and T, to qT and aT (n, P)."""
+    n, _, P = aq.shape
+    rate = np.zeros(P)
+    for i in range(n):
+        for k in range(v.shape[0]):
+            rate[k] = -2.0 / T * v[k, i]
+        for j in range(n):
+            by_q, by_a, cross, square = qT[j], aT[j], aq[i, j], aa[i, j]
+            for k in range(P):
+                by_q[k] += cross[k] * rate[k]
+                by_a[k] += square[k] * rate[k]
+
+
+@njit(cache=True, error_model="numpy")
+def _with_duration(blocks: Array, ww: Array, slope: Array, by_T: Array, k: int) -> float:
+    """Near the ends q, w, a depend on T themselves: add to the derivatives by T at k, return what the corner gains."""
+    qq, aq, aa = blocks[0], blocks[1], blocks[2]
+    qT, wT, aT = by_T[0], by_T[1], by_T[2]
+    n = qq.shape[0]
+    corner = 0.0
+    for i in range(n):
+        q, w, a = slope[POSITION, k, i], slope[RATE, k, i], slope[CURVATURE, k, i]
+        corner += 2.0 * (q * qT[i, k] + w * wT[i, k] + a * aT[i, k]) + w * w * ww[i, k]
+        for j in range(n):
+            q_j, a_j = slope[POSITION, k, j], slope[CURVATURE, k, j]
+            corner += q * (qq[i, j, k] * q_j + 2.0 * aq[j, i, k] * a_j) + a * aa[i, j, k] * a_j
+    for i in range(n):
+        wT[i, k] += ww[i, k] * slope[RATE, k, i]
+        for j in range(n):
+            qT[i, k] += qq[i, j, k] * slope[POSITION, k, j] + aq[j, i, k] * slope[CURVATURE, k, j]
+            aT[i, k] += aq[i, j, k] * slope[POSITION, k, j] + aa[i, j, k] * slope[CURVATURE, k, j]
+    return corner
+
+
+@njit(cache=True, error_model="numpy")
+def _border(tap: ThreeTap, by_T: Array, border: Array) -> None:
+    """Take derivatives by q, w or a and T (3, n, P) to those by x and T (K, W)."""
+    border[:] = 0.0
+    for k in range(tap.first.size):
+        for b in range(TAPS):
+            q_b, w_b, a_b = tap.taps[k, b]
+            for i in range(by_T.shape[1]):
+                border[tap.first[k] + b, i] += q_b * by_T[0, i, k] + w_b * by_T[1, i, k] + a_b * by_T[2, i, k]
+
+
+@njit(cache=True, error_model="numpy")
+def _band(tap: ThreeTap, blocks: Array, ww: Array, band: Array) -> None:
+    """Take second derivatives by q, w and a to those by x.
+
+    The taps of the column are applied first, then those of the row. All but two grid points at each end have k − 2 as
+    the first of their unknowns.
+    """
+    qq, aq, aa = blocks[0], blocks[1], blocks[2]
+    first, K, n = tap.first, tap.first.size, qq.shape[0]
+    W = band.shape[2] // TAPS
+    q, w, a = np.empty((TAPS, K)), np.empty((TAPS, K)), np.empty((TAPS, K))
+    for k in range(K):
+        for b in range(TAPS):
+            q[b, k], w[b, k], a[b, k] = tap.taps[k, b]
+    by_q, by_a, sums = np.empty(K), np.empty(K), np.empty((TAPS, K))
+    inner_q, inner_a = by_q[2:], by_a[2:]
+    for j in range(n):
+        for i in range(n):
+            # Above the diagonal stand zeros.
+            nearest = 0 if i >= j else 1
+            sums[:] = 0.0
+            square, cross_j, cross_i, last = qq[i, j], aq[j, i], aq[i, j], aa[i, j]
+            for b in range(TAPS - nearest):
+                q_b, a_b = q[b], a[b]
+                for k in range(K):
+                    by_q[k] = q_b[k] * square[k] + a_b[k] * cross_j[k]
+                    by_a[k] = q_b[k] * cross_i[k] + a_b[k] * last[k]
+                for e in range(nearest, TAPS - b):
+                    q_e, a_e, total = q[b + e, 2:], a[b + e, 2:], sums[e, b:]
+                    for k in range(K - 4):
+                        total[k] += q_e[k] * inner_q[k] + a_e[k] * inner_a[k]
+                    for k in (0, 1, K - 2, K - 1):
+                        sums[e, first[k] + b] += q[b + e, k] * by_q[k] + a[b + e, k] * by_a[k]
+                    if i == j:
+                        for k in range(K):
+                            sums[e, first[k] + b] += w[b + e, k] * w[b, k] * ww[i, k]
+            for e in range(TAPS):
+                for c in range(K - 2):
+                    band[c, j, e * W + i] = sums[e, c]
+    band[K - 2 :] = 0.0

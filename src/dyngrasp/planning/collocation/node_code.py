@@ -17,8 +17,7 @@ from fractions import Fraction
 import casadi as ca
 
 from dyngrasp.planning.collocation.code_cache import CompilationError
-
-LANES = 8
+from dyngrasp.planning.collocation.work_arrays import LANES
 
 # Operations that vectors have themselves.
 _ARITHMETIC = {
@@ -90,6 +89,8 @@ def _series(powers: range) -> str:
 HEADER = f"""#include <math.h>
 enum {{ LANES = {LANES} }};
 typedef double real __attribute__((vector_size(LANES * sizeof(double))));
+/* The same in an array of numbers, which may begin anywhere. */
+typedef double run __attribute__((vector_size(LANES * sizeof(double)), aligned(sizeof(double)), may_alias));
 typedef long long whole __attribute__((vector_size(LANES * sizeof(double))));
 typedef long long count;
 

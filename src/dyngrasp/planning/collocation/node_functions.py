@@ -60,10 +60,10 @@ class NodeFunctions(Protocol):
             q: As for `values`, and so are the next two.
             v: (K, n)
             p: (K, n_p)
-            weights: (K, total)
+            weights: (total, P), P being K padded to full vectors (`work_arrays`).
             g: (K, total), written in the same columns.
-            jacobian: (K, total, 2n), written in the same rows.
-            hessian: (K, 2n, 2n), added to.
+            jacobian: (total, 2n, P), written in the rows from `column` on.
+            hessian: (2n, 2n, P), added to.
             column: As for `values`.
         """
         ...
@@ -137,11 +137,11 @@ class InterpretedNodeFunctions:
         """See `NodeFunctions`."""
         K, n = q.shape
         here = slice(column, column + self.rows)
-        values, rows, curvature = self._over(K)[1](q.T, v.T, p.T, weights[:, here].T)
+        values, rows, curvature = self._over(K)[1](q.T, v.T, p.T, weights[here, :K])
         g[:, here] = values.full().T
         # The map sets K matrices side by side; each column of one is a row of the transpose.
-        jacobian[:, here] = rows.full().T.reshape(K, self.rows, 2 * n)
-        hessian += curvature.full().T.reshape(K, 2 * n, 2 * n)
+        jacobian[here, :, :K] = np.moveaxis(rows.full().T.reshape(K, self.rows, 2 * n), 0, -1)
+        hessian[:, :, :K] += np.moveaxis(curvature.full().T.reshape(K, 2 * n, 2 * n), 0, -1)
 
     def bound(
         self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
@@ -187,30 +187,27 @@ class CompiledNodeFunctions:
         self, q: Array, v: Array, p: Array, weights: Array, g: Array, jacobian: Array, hessian: Array, column: int
     ) -> tuple[Evaluation, Evaluation]:
         """See `NodeFunctions`."""
-        points, total, at = len(q), g.shape[1], 8 * column
-        here = (q.ctypes.data, v.ctypes.data, p.ctypes.data)
-        rows = g.ctypes.data + at
-        slopes = jacobian.ctypes.data + at * jacobian.shape[2]
-        return (
-            partial(self._values, points, *here, rows, total),
-            partial(
-                self._derivatives, points, *here, weights.ctypes.data + at, rows, slopes, hessian.ctypes.data, total
-            ),
+        points, total = len(q), g.shape[1]
+        here, rows = (q.ctypes.data, v.ctypes.data, p.ctypes.data), g.ctypes.data + g.itemsize * column
+        by_rows = (weights.ctypes.data + column * weights.strides[0], rows)
+        by_rows += (jacobian.ctypes.data + column * jacobian.strides[0], hessian.ctypes.data)
+        return partial(self._values, points, *here, rows, total), partial(
+            self._derivatives, points, *here, *by_rows, total
         )
 
 
-# A group of grid points is gathered into vectors, evaluated and scattered; the last group may be smaller, its idle
-# lanes repeat the last grid point.
+# A group of grid points is gathered into vectors and evaluated. The last group may be smaller, its idle lanes repeat
+# the last grid point; arrays whose last axis are the grid points have room for them.
 _LOOPS = """
-#define GATHER(at, source, size, stride) \\
+#define GATHER(at, source, size) \\
   for (int i = 0; i < (size); ++i) \\
-    for (int l = 0; l < LANES; ++l) in[(at) + i][l] = (source)[(k + (l < lanes ? l : lanes - 1)) * (stride) + i];
+    for (int l = 0; l < LANES; ++l) in[(at) + i][l] = (source)[(k + (l < lanes ? l : lanes - 1)) * (size) + i];
 
 void values_over_grid(count points, const double* q, const double* v, const double* p, double* g, count total) {{
   real in[{inputs}], out[{rows}];
   for (count k = 0; k < points; k += LANES) {{
     const count lanes = points - k < LANES ? points - k : LANES;
-    GATHER(0, q, {n}, {n}) GATHER({n}, v, {n}, {n}) GATHER({twice}, p, {n_p}, {n_p})
+    GATHER(0, q, {n}) GATHER({n}, v, {n}) GATHER({twice}, p, {n_p})
     values(in, out);
     for (count l = 0; l < lanes; ++l)
       for (int i = 0; i < {rows}; ++i) g[(k + l) * total + i] = out[i][l];
@@ -221,20 +218,20 @@ static const short jacobian_at[] = {{{jacobian_at}}}, curvature_at[] = {{{curvat
 
 void derivatives_over_grid(count points, const double* q, const double* v, const double* p, const double* weights,
                            double* g, double* jacobian, double* hessian, count total) {{
+  const count room = (points + LANES - 1) / LANES * LANES;
+  const run none = {{0}};
   real in[{inputs} + {rows}], out[{outputs}];
   for (count k = 0; k < points; k += LANES) {{
     const count lanes = points - k < LANES ? points - k : LANES;
-    GATHER(0, q, {n}, {n}) GATHER({n}, v, {n}, {n}) GATHER({twice}, p, {n_p}, {n_p})
-    GATHER({inputs}, weights, {rows}, total)
+    GATHER(0, q, {n}) GATHER({n}, v, {n}) GATHER({twice}, p, {n_p})
+    for (int i = 0; i < {rows}; ++i) in[{inputs} + i] = *(const run*)(weights + i * room + k);
     derivatives(in, out);
-    for (count l = 0; l < lanes; ++l) {{
-      double* here = jacobian + (k + l) * total * {twice};
-      double* curvature = hessian + (k + l) * {twice} * {twice};
+    for (count l = 0; l < lanes; ++l)
       for (int i = 0; i < {rows}; ++i) g[(k + l) * total + i] = out[i][l];
-      for (int i = 0; i < {rows} * {twice}; ++i) here[i] = 0.0;
-      for (int i = 0; i < {in_jacobian}; ++i) here[jacobian_at[i]] = out[{rows} + i][l];
-      for (int i = 0; i < {in_curvature}; ++i) curvature[curvature_at[i]] += out[{rows} + {in_jacobian} + i][l];
-    }}
+    for (int i = 0; i < {rows} * {twice}; ++i) *(run*)(jacobian + i * room + k) = none;
+    for (int i = 0; i < {in_jacobian}; ++i) *(run*)(jacobian + jacobian_at[i] * room + k) = out[{rows} + i];
+    for (int i = 0; i < {in_curvature}; ++i)
+      *(run*)(hessian + curvature_at[i] * room + k) += out[{rows} + {in_jacobian} + i];
   }}
 }}
 """

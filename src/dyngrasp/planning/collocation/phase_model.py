@@ -98,19 +98,20 @@ class PhaseModel:
             column += function.rows
             if function.depends_on_acceleration.any():
                 continue
-            work.weights[:, rows] = inverse_scale[rows]
+            work.weights[rows] = inverse_scale[rows, None]
             evaluate()
-            slopes.append(((work.jacobian[1:-1, rows] * inverse_scale[rows, None]) ** 2).sum(axis=2))
+            inner = work.jacobian[rows, :, 1 : self.intervals]
+            slopes.append(((inner * inverse_scale[rows, None, None]) ** 2).sum(axis=1))
         if not slopes:
             return 0.0
-        steepest = np.concatenate(slopes, axis=1).max(axis=1)
-        return float((np.sqrt((work.hessian[1:-1] ** 2).sum(axis=(1, 2))) / steepest).max())
+        steepest = np.concatenate(slopes).max(axis=0)
+        return float((np.sqrt((work.hessian[:, :, 1 : self.intervals] ** 2).sum(axis=(0, 1))) / steepest).max())
 
     def derivatives(self, x: Array, T: float, multiplier: Array, g: Array) -> float:
         """As `values`, and prepare everything below for this point and these multipliers."""
         self._place(x, T)
         work = self.work
-        limit_rows.constraint_weights(multiplier, self._arguments, work.weights)
+        limit_rows.constraint_weights(multiplier, len(work.v), self._arguments, work.weights)
         work.hessian[:] = 0.0
         for _, evaluate in self._evaluations:
             evaluate()
@@ -149,8 +150,7 @@ class PhaseModel:
 
     def solve(self, x: Array, by_T: float) -> float:
         """Overwrite a right-hand side x (N−1, n) by the solution; return its last unknown."""
-        work = self.work
-        return _solve(work.band, work.solved_column, self.complement, x, by_T, np.inf, self.limits.fixed_duration)
+        return _solve(self.work, self.complement, x, by_T, np.inf, self.limits.fixed_duration)
 
 
 @njit(cache=True, error_model="numpy")
@@ -173,28 +173,27 @@ def _factorise(
     shift: float,
 ) -> tuple[bool, float, float]:
     """Whether the banded part is positive definite, the corner, and its Schur complement."""
-    column = np.empty(work.solved_column.size)
-    corner = newton_matrix.assemble(work, T, tap, limits, omega, multiplier, rho, factor, curvature, shift, column)
+    corner = newton_matrix.assemble(work, T, tap, limits, omega, multiplier, rho, factor, curvature, shift)
     if not banded.cholesky(work.band):
         return False, corner, np.nan
-    complement = banded.schur_complement(work.band, column, corner, work.solved_column)
+    banded.forward(work.band, work.border)
+    complement = corner - banded.product(work.border, work.border)
     return bool(np.isfinite(complement)), corner, complement
 
 
 @njit(cache=True, error_model="numpy")
-def _solve(
-    band: Array, solved_column: Array, complement: float, x: Array, by_T: float, longest: float, fixed: bool
-) -> float:
-    unknowns = x.reshape(x.size)
-    if fixed:
-        banded.solve_in_place(band, unknowns)
-        return 0.0
-    step = banded.solve_bordered(band, solved_column, complement, unknowns, by_T)
-    if abs(step) <= longest:
-        return step
-    cut = np.copysign(longest, step)
-    unknowns += (step - cut) * solved_column
-    return cut
+def _solve(work: WorkArrays, complement: float, x: Array, by_T: float, longest: float, fixed: bool) -> float:
+    """Overwrite x (N−1, n) by the solution; return the last unknown, `longest` at most, or 0 if it is fixed."""
+    rows, n = x.shape
+    for i in range(rows):
+        for j in range(n):
+            work.x[i, j] = x[i, j]
+    longest = 0.0 if fixed else longest
+    step = banded.solve_bordered(work.band, work.border, complement, work.x, by_T, longest)
+    for i in range(rows):
+        for j in range(n):
+            x[i, j] = work.x[i, j]
+    return step
 
 
 @njit(cache=True, error_model="numpy")
@@ -215,7 +214,7 @@ def _newton_step(
     by_T = _descent(y, T, work, tap, limits, rho, factor, rhs)
     dx[:] = rhs
     fixed = limits[-1]
-    dT = _solve(work.band, work.solved_column, complement, dx, by_T, longest, fixed)
+    dT = _solve(work, complement, dx, by_T, longest, fixed)
     three_tap.expand_step(tap, dx, dT, work.dz)
     limit_rows.row_steps(work.dz, dT, T, work.v, work.jacobian, limits, dg)
     product = by_T * dT
@@ -230,7 +229,7 @@ def _descent(
     y: Array, T: float, work: WorkArrays, tap: ThreeTap, limits: tuple, rho: float, factor: float, out: Array
 ) -> float:
     dual, weights = np.zeros(work.z.shape), np.empty(work.weights.shape)
-    limit_rows.constraint_weights(y, limits, weights)
+    limit_rows.constraint_weights(y, work.v.shape[0], limits, weights)
     by_T = limit_rows.rows_transposed(y, T, work.v, work.jacobian, limits, weights, dual)
     by_T += newton_matrix.add_objective_gradient(work.z[CURVATURE], T, rho, -factor, dual)
     return by_T + three_tap.pull_back(tap, dual, out)

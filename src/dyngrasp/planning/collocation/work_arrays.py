@@ -8,21 +8,32 @@ import numpy as np
 
 from dyngrasp.signals import Array
 
+LANES = 8
+"""Numbers in the widest vectors of today's processors; runs of memory that are worked on at once are multiples."""
+
+
+def padded(size: int) -> int:
+    """The least multiple of `LANES` that is not below size."""
+    return -(-size // LANES) * LANES
+
 
 class WorkArrays(NamedTuple):
     """Arrays of one problem structure, used again by every problem that shares it.
 
-    K = N + 1 grid points, n joints, m rows c of the constraints at a grid point.
+    K = N + 1 grid points, n joints, m rows c of the constraints at a grid point; P and W are K and n padded. Where P is
+    the last axis one operation serves all grid points; what stands there past the last grid point means nothing.
 
     Attributes:
         z: (3, K, n) q, w, a at the present point.
         v: (K, n) a / T².
         c: (K, m) rows of the constraints there.
-        weights: (K, m) factors of c in Σ λ g.
-        jacobian: (K, m, 2n) derivatives of c by (q, v).
-        hessian: (K, 2n, 2n) second derivatives of Σ weights · c by (q, v).
-        band: ((K−2) n, 3n) of the Newton matrix or of its Cholesky factor; layout as in `banded`.
-        solved_column: ((K−2) n,) the band's inverse times the column of T.
+        weights: (m, P) factors of c in Σ λ g.
+        jacobian: (m, 2n, P) derivatives of c by (q, v).
+        hessian: (2n, 2n, P) second derivatives of Σ weights · c by (q, v).
+        blocks: (3, n, n, P) what the Newton matrix is of q, a in the space of every grid point; see `newton_matrix`.
+        band: (K, n, 3W) of the Newton matrix or of its Cholesky factor; layout as in `banded`.
+        border: (K, W) column of T of the same, or last row of the factor.
+        x: (K, W) a right-hand side, or its solution.
         dz: (3, K, n) step of q, w, a.
     """
 
@@ -32,23 +43,27 @@ class WorkArrays(NamedTuple):
     weights: Array
     jacobian: Array
     hessian: Array
+    blocks: Array
     band: Array
-    solved_column: Array
+    border: Array
+    x: Array
     dz: Array
 
     @classmethod
     def of(cls, points: int, joints: int, constraint_rows: int) -> WorkArrays:
         """Zeros of the shapes that K, n and m ask for."""
         K, n, m = points, joints, constraint_rows
-        unknowns = (K - 2) * n
+        P, W = padded(K), padded(n)
         return cls(
             z=np.zeros((3, K, n)),
             v=np.zeros((K, n)),
             c=np.zeros((K, m)),
-            weights=np.zeros((K, m)),
-            jacobian=np.zeros((K, m, 2 * n)),
-            hessian=np.zeros((K, 2 * n, 2 * n)),
-            band=np.zeros((unknowns, 3 * n)),
-            solved_column=np.zeros(unknowns),
+            weights=np.zeros((m, P)),
+            jacobian=np.zeros((m, 2 * n, P)),
+            hessian=np.zeros((2 * n, 2 * n, P)),
+            blocks=np.zeros((3, n, n, P)),
+            band=np.zeros((K, n, 3 * W)),
+            border=np.zeros((K, W)),
+            x=np.zeros((K, W)),
             dz=np.zeros((3, K, n)),
         )
