@@ -8,6 +8,7 @@ share.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -20,7 +21,7 @@ from dyngrasp.models import symbolic
 from dyngrasp.models.pinch import Pinch, pad_loads
 from dyngrasp.models.robot import RobotModel
 from dyngrasp.planning.problem import NodeConstraint
-from dyngrasp.signals import Array
+from dyngrasp.signals import Array, frozen
 
 if TYPE_CHECKING:
     from dyngrasp.models.grasp_object import Funnel
@@ -224,12 +225,16 @@ def lift_floor(start: ArrayLike, end: ArrayLike, intervals: int, depth: float = 
         (N+1, K) heights (m).
     """
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
-    # Quadratic, so that a delivery that begins at rest can follow.
-    risen = np.minimum(np.linspace(0.0, 1.0, intervals + 1) / LIFT_SHARE, 1.0)[:, None] ** 2
-    lowest = np.minimum(start, 0.0)
+    lowest, end_height = np.minimum(start, 0.0), float(end.min())
     # A target on or in the ground is the user's wish; then the part only has to stay above both ends.
-    goal = LIFT_CLEARANCE if (end > LIFT_CLEARANCE).all() else min(float(end.min()), 0.0)
-    return lowest + risen * np.maximum(goal - lowest, 0.0) - depth
+    goal = LIFT_CLEARANCE if end_height > LIFT_CLEARANCE else min(end_height, 0.0)
+    return lowest + _risen(intervals) * np.maximum(goal - lowest, 0.0) - depth
+
+
+@lru_cache(maxsize=64)
+def _risen(intervals: int) -> Array:
+    """(N+1, 1) parts of the way up. Quadratic, so that a delivery that begins at rest can follow."""
+    return frozen(np.minimum(np.linspace(0.0, 1.0, intervals + 1) / LIFT_SHARE, 1.0)[:, None] ** 2)
 
 
 def _in_grasp_frame(robot: RobotModel, q: ca.SX, p_G: ca.SX, frame: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -281,8 +286,8 @@ def _at_each(points: int, *parts: Array) -> Array:
     for part in parts:
         parameters[:, column : column + part.shape[-1]] = part
         column += part.shape[-1]
-    return parameters
+    return frozen(parameters)
 
 
 def _bound(*values: float) -> Array:
-    return np.array(values)
+    return frozen(np.array(values))

@@ -20,7 +20,6 @@ __all__ = [
     "BoundaryState",
     "GraspTargets",
     "check_grasp",
-    "flange_poses",
     "grasp_targets",
     "moved",
     "ranked_grasp_targets",
@@ -81,7 +80,7 @@ class GraspTargets:
     @cached_property
     def moving(self) -> bool:
         """Whether the part moves."""
-        return bool(np.any(self.twist_world))
+        return bool(self.twist_world.any())
 
     def T_world_object_at(self, t: float) -> pin.SE3:
         """Pose of the part at time t (s): it keeps its velocities until it is taken at `grasp_time`."""
@@ -194,22 +193,14 @@ def check_grasp(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> None:
         )
 
 
-def flange_poses(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask) -> tuple[pin.SE3, pin.SE3]:
-    """Flange poses at the pre-grasp (open gripper) and at the grasp (closed): they differ by the travel of G."""
-    T_world_grasp = T_world_object * grasp.T_object_grasp
-    above = pin.SE3(np.eye(3), np.array([0.0, 0.0, task.settings.pregrasp_distance]))
-    closed = task.T_flange_closed(grasp)
-    return T_world_grasp * above * task.T_flange_open.inverse(), T_world_grasp * closed.inverse()
-
-
 def _grasp_postures(grasp: Grasp, T_world_object: pin.SE3, task: GraspTask, q_start: Array) -> tuple[Array, Array]:
     """(k, n) configurations at the grasp and their travel times (k,) (s), at least one of them finite."""
     limits, margin = task.robot.limits, task.settings.limit_margin
-    _, T_world_flange = flange_poses(grasp, T_world_object, task)
-    postures = task.kinematics.solutions(T_world_flange)
+    T_world_grasp = T_world_object * grasp.T_object_grasp
+    postures = task.kinematics.solutions(T_world_grasp * task.T_flange_closed(grasp).inverse())
     inside = limits.position_lower + margin, limits.position_upper - margin
     times = _travel_times(postures, *inside, q_start, task.place, limits.velocity)
-    if not np.isfinite(times).any():
+    if times.min() == np.inf:
         raise _no_posture(grasp, task)
     return postures, times
 
@@ -234,12 +225,13 @@ def _travel_times(postures: Array, lower: Array, upper: Array, start: Array, pla
 
 def _fastest_first(found: list[tuple[Grasp, Array, Array]]) -> Iterator[tuple[Grasp, Array]]:
     """Grasps with postures in the order of their travel times: most often only the first is asked for."""
-    grasps, postures, times = zip(*found, strict=True)
-    first, left = np.cumsum([0, *(len(some) for some in postures)]), np.concatenate(times)
-    while np.isfinite(left[k := int(left.argmin())]):
-        left[k] = np.inf
-        i = int(np.searchsorted(first, k, side="right")) - 1
-        yield grasps[i], postures[i][k - first[i]]
+    while True:
+        grasp, postures, times = min(found, key=lambda one: one[2].min())
+        k = int(times.argmin())
+        if times[k] == np.inf:
+            return
+        times[k] = np.inf
+        yield grasp, postures[k]
 
 
 def _no_posture(grasp: Grasp, task: GraspTask) -> OutOfReach:
@@ -250,16 +242,17 @@ def _no_posture(grasp: Grasp, task: GraspTask) -> OutOfReach:
 
 def _targets_at(q: Array, grasp: Grasp, T_world_object: pin.SE3, task: GraspTask, q_start: Array) -> GraspTargets:
     robot, settings = task.robot, task.settings
-    T_pregrasp, _ = flange_poses(grasp, T_world_object, task)
-    approach_axis = (T_world_object * grasp.T_object_grasp).rotation[:, 2]
+    T_world_grasp = T_world_object * grasp.T_object_grasp
+    above = pin.SE3(np.eye(3), np.array([0.0, 0.0, settings.pregrasp_distance]))
 
     swivel = swivel_velocity(q, q_start, task)
     # A symmetric reversal covers the swivel rate times the duration; the pre-grasp posture lies that far back.
     q_before = q - swivel * (settings.grasp_duration_min + settings.grasp_duration_max) / 2
-    q_pregrasp = task.kinematics.nearest(T_pregrasp, q_before)
+    q_pregrasp = task.kinematics.nearest(T_world_grasp * above * task.T_flange_open.inverse(), q_before)
 
     lift = np.array([0.0, 0.0, settings.lift_speed, 0.0, 0.0, 0.0])
-    approach = np.concatenate([-settings.approach_speed * approach_axis, np.zeros(3)])
+    approach = np.zeros(6)
+    approach[:3] = -settings.approach_speed * T_world_grasp.rotation[:, 2]
     swivel_before = swivel_velocity(q_pregrasp, q_start, task, like=swivel)
     return GraspTargets(
         T_world_object=T_world_object,

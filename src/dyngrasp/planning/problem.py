@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import casadi
@@ -241,9 +242,9 @@ class AuditReport:
     @property
     def ok(self) -> bool:
         """Whether the plan may be executed."""
-        return all(entry.ok for entry in self.entries)
+        return not self.failures
 
-    @property
+    @cached_property
     def failures(self) -> tuple[AuditEntry, ...]:
         """The entries that do not hold."""
         return tuple(entry for entry in self.entries if not entry.ok)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dyngrasp.planning.collocation.closed_form import rest_to_rest
-from dyngrasp.signals import Array, read_only
+from dyngrasp.signals import Array, frozen, read_only
 from dyngrasp.trajectory import Trajectory
 
 
@@ -43,7 +43,7 @@ class GripperPath:
 
     def over(self, duration: float) -> Trajectory:
         """The motion in real time; satisfies the trapezoidal rule."""
-        return Trajectory(duration, self.position, self.rate / duration, self.curvature / duration**2)
+        return Trajectory(duration, self.position, frozen(self.rate / duration), frozen(self.curvature / duration**2))
 
 
 def gripper_path(start: ArrayLike, end: ArrayLike, intervals: int) -> GripperPath:

@@ -17,7 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from dyngrasp.planning.collocation.three_tap import CURVATURE, POSITION, TAPS, ThreeTap
+from dyngrasp.planning.collocation.three_tap import CURVATURE, RATE, Indices, ThreeTap
 from dyngrasp.planning.problem import NodeConstraint, PhaseProblem
 from dyngrasp.signals import Array
 
@@ -44,28 +44,19 @@ class Window:
     @classmethod
     def of(cls, problem: PhaseProblem, whole: ThreeTap, constraints: list[NodeConstraint], first: int) -> Window:
         """The window of a problem, `whole` its map, with some of its constraints."""
-        N, n = problem.intervals, problem.joints
-        points = STANDING_FOR + N + 1 - first
-        _, factor, _ = _before(N, first)
-        at = (np.array([first - 1, first]) / N)[:, None]
-        index = np.zeros(points, dtype=np.intp)
-        index[STANDING_FOR:] = whole.first[first:] - (first - 2)
-        taps, offset, slope = np.zeros((points, TAPS, 3)), np.empty((3, points, n)), np.zeros((3, points, n))
-        taps[STANDING_FOR:] = whole.taps[first:]
-        offset[:, STANDING_FOR:], slope[:, STANDING_FOR:] = whole.offset[:, first:], whole.slope[:, first:]
+        rows, _, factor, at = _before(problem.intervals, first)
+        index, taps = whole.first[rows] - (first - STANDING_FOR), whole.taps[rows]
+        offset, slope = whole.offset.take(rows, axis=1), whole.slope.take(rows, axis=1)
         # Their position is that of the first grid point of the window, so that rows hold there if they hold here.
-        taps[:STANDING_FOR, :, POSITION] = whole.taps[first, :, POSITION]
-        offset[:, :STANDING_FOR] = 0.0
-        offset[POSITION, :STANDING_FOR] = whole.offset[POSITION, first]
-        taps[:STANDING_FOR, :2, CURVATURE] = factor.T
-        offset[CURVATURE, :STANDING_FOR] = -factor.T @ np.tile(problem.start_position, (2, 1))
-        slope[CURVATURE, :STANDING_FOR] = -factor.T @ (at * problem.start_velocity)
+        taps[:STANDING_FOR, :, RATE:] = offset[RATE:, :STANDING_FOR] = 0.0
+        taps[:STANDING_FOR, :STANDING_FOR, CURVATURE] = factor
+        offset[CURVATURE, :STANDING_FOR] = -factor.sum(axis=1, keepdims=True) * problem.start_position
+        slope[CURVATURE, :STANDING_FOR] = -(factor @ at) * problem.start_velocity
+        weight = problem.effort_weight * (rows.size - 1) / problem.intervals
         # As those of the whole grid are: compiled code is made for read-only arrays, once.
         index.setflags(write=False)
         taps.setflags(write=False)
-        parameters = tuple(c.parameters[[first, first, *range(first, N + 1)]] for c in constraints)
-        weight = problem.effort_weight * (points - 1) / N
-        return cls(first, ThreeTap(index, taps, offset, slope), parameters, weight)
+        return cls(first, ThreeTap(index, taps, offset, slope), tuple(c.parameters[rows] for c in constraints), weight)
 
     def unknowns(self, x: Array) -> Array:
         """Those of the window among the unknowns (N−1, n) of the whole phase."""
@@ -73,19 +64,17 @@ class Window:
 
     def curvature(self, problem: PhaseProblem, x: Array, T: float) -> Array:
         """(N+1, n) accelerations in normalised time of the whole phase, from the unknowns of the window."""
-        N = problem.intervals
-        matrix, _, C = _before(N, self.first)
-        at = (np.array([self.first - 1, self.first]) / N)[:, None]
-        e = x[:2] - problem.start_position - at * T * problem.start_velocity
+        _, inverse, _, at = _before(problem.intervals, self.first)
+        e = x[:STANDING_FOR] - problem.start_position - at * T * problem.start_velocity
         inside = self.map.expand(x, T)[CURVATURE, STANDING_FOR:]
-        return np.vstack([matrix.T @ (C @ e), inside])
+        return np.concatenate([inverse @ e, inside])
 
 
 @lru_cache(maxsize=64)
-def _before(intervals: int, first: int) -> tuple[Array, Array, Array]:
-    """(2, k0) M, (2, 2) L and C."""
-    i = np.arange(first)
-    rows = [np.where(i > 0, np.maximum(m - i, 0.0), m / 2 - 0.25) for m in (first - 1, first)]
-    matrix = np.array(rows) / intervals**2
+def _before(intervals: int, first: int) -> tuple[Indices, Array, Array, Array]:
+    """Which grid points the window has, (W,), Mᵀ C (k0, 2), Lᵀ (2, 2), and when r[k0−1] and r[k0] are passed (2, 1)."""
+    i, ends = np.arange(first), np.array([first - 1, first])
+    matrix = np.array([np.where(i > 0, np.maximum(m - i, 0.0), m / 2 - 0.25) for m in ends]) / intervals**2
     C = np.asarray(np.linalg.inv(matrix @ matrix.T), dtype=float)
-    return matrix, np.asarray(np.linalg.cholesky(C), dtype=float), C
+    rows = np.concatenate([[first] * STANDING_FOR, np.arange(first, intervals + 1)])
+    return rows, matrix.T @ C, np.asarray(np.linalg.cholesky(C), dtype=float).T, ends[:, None] / intervals
