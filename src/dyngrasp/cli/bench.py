@@ -94,7 +94,7 @@ def _replan(options: argparse.Namespace) -> int:
     cycles = [row for row in rows if row["solver"] == "replanner" and row["case"] != "late_moves"]
     errors = [row for row in rows if row["case"] == "end_point_error"]
     for title, shown, columns in (
-        ("Quadratic program, ms", programs, ("case", "solver", "n", "solved", *_TIMES)),
+        ("Quadratic program, ms", programs, ("case", "solver", "n", "solved", "active_rows", *_TIMES)),
         ("Whole cycle, ms", cycles, ("case", "n", *_TIMES, "published", "kept", "late", "published_invalid", "jumps")),
         ("Share of moves followed, by the rest of the approach", late, ("left_s", "n", *(f"{mm}_mm" for mm in MOVES))),
         ("Miss at the pre-grasp", errors, ("solver", "duration_weight", "move", "error_mm")),

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from dyngrasp.errors import OutOfReach
 from dyngrasp.experiments.bench_plan import PLACE_DEG, START_DEG
 from dyngrasp.experiments.end_point_errors import end_point_rows
+from dyngrasp.experiments.online_programs import QP_CASES, peer_row, qp_problems, structured_row
 from dyngrasp.experiments.statistics import timing_summary
 from dyngrasp.models.catalogue import load_gripper, load_object, load_robot
 from dyngrasp.planning.audit import audit
@@ -21,23 +21,12 @@ from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.problem import Status
-from dyngrasp.planning.replanning.general_solvers import solver_of
-from dyngrasp.planning.replanning.lcqp import sparse_program
 from dyngrasp.planning.replanning.phase_programs import APPROACH
 from dyngrasp.planning.replanning.replanner import Path, Replanner, ReplanResult
-from dyngrasp.planning.replanning.splice import rest_of
-from dyngrasp.planning.replanning.target_update import updated_targets
-from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingWeights, paper_step, solve_tracking
 from dyngrasp.signals import PoseEstimate
-from dyngrasp.trajectory import GraspPlan, Trajectory
+from dyngrasp.trajectory import GraspPlan
 
 RATE = 10.0  # replans a second in the sequences (Hz)
-
-# Of the program alone: like the paper's, with weight on everything.
-_WEIGHTS = TrackingWeights(0.1, 0.1, 1.0, 100.0)
-
-# With the speed limits at this share of what the motion asks, some sixty rows of the program are active.
-_ACTIVE_SHARE = 0.985
 
 # What is left of the approach at a late move (s), and how far the part moves (mm); it turns by up to 1° for 4 mm.
 LEFT = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35, 0.25, 0.15)
@@ -91,14 +80,14 @@ def bench_replan(
     # A pass of the garbage collector over all that was set up takes 0.1 s: it looks at what is new.
     gc.freeze()
     rows: list[dict[str, Any]] = []
-    for case in ("qp_free", "qp_active"):
+    for case in QP_CASES:
         progress(f"{case}: structured")
-        problems = list(qp_problems(cell, case, cycles, seed))
-        rows.append(_structured_row(case, problems))
+        rows.append(structured_row(case, qp_problems(cell.plan, cell.targets, cell.task, case, cycles, seed)))
+        # General solvers take up to a thousand times longer; a few dozen calls tell their median.
+        few = list(qp_problems(cell.plan, cell.targets, cell.task, case, min(cycles, 40), seed)) if against else []
         for name in against:
             progress(f"{case}: {name}")
-            # General solvers take up to a thousand times longer; a few dozen calls tell their median.
-            rows.append(_peer_row(case, name, problems[: min(cycles, 40)]))
+            rows.append(peer_row(case, name, few))
     # These need every way to a new plan: what is loaded at its first use is loaded before cycles are timed.
     progress("moves late in the approach")
     late = late_move_rows(cell, max(cycles // 100, 4), seed)
@@ -106,86 +95,6 @@ def bench_replan(
     progress("end point errors of the two updates")
     rows += end_point_rows(cell.plan, cell.targets, cell.task, seed)
     return [row | {"rho": effort_weight} for row in rows]
-
-
-def qp_problems(cell: Cell, case: str, count: int, seed: int) -> Iterator[TrackingProblem]:
-    """Programs of the approach: random splices, the part moved by up to 3 cm and 8°."""
-    rng = np.random.default_rng(seed)
-    task, plan, limits = cell.task, cell.plan, cell.task.robot.limits
-    made = 0
-    while made < count:
-        t = plan.start_time + rng.uniform(0.0, 0.8) * plan.durations[APPROACH]
-        try:
-            targets = updated_targets(cell.targets, _displaced(cell.targets.T_world_object, rng, 0.03, 8.0), task)
-        except OutOfReach:
-            continue
-        reference = _consistent(rest_of(plan.arm[APPROACH], t - plan.start_time, plan.arm[APPROACH].intervals))
-        state, end = plan.sample(t).arm, targets.pregrasp
-        speed = limits.velocity
-        if case == "qp_active":
-            asked = np.abs(reference.velocity).max(axis=0)
-            at_ends = np.maximum(np.abs(state.velocity), np.abs(end.velocity))
-            speed = np.maximum(_ACTIVE_SHARE * asked, 1.02 * at_ends)
-        made += 1
-        yield TrackingProblem(
-            reference,
-            np.stack([state.position, state.velocity, state.acceleration]),
-            np.stack([end.position, end.velocity, reference.acceleration[-1]]),
-            True,
-            True,
-            limits.position_lower,
-            limits.position_upper,
-            speed,
-            limits.acceleration,
-            0.3 * reference.duration,
-            3.0 * reference.duration,
-            _WEIGHTS,
-            paper_rows=True,
-        )
-
-
-def _consistent(motion: Trajectory) -> Trajectory:
-    """The nearest motion that obeys the trapezoidal rule, as eq. (9) supposes of a reference; samples nearly do."""
-    start, end = (np.stack([motion.position[k], motion.velocity[k], motion.acceleration[k]]) for k in (0, -1))
-    wide = np.full(motion.position.shape[1], np.inf)
-    problem = TrackingProblem(
-        motion, start, end, True, True, -wide, wide, wide, wide, motion.duration, motion.duration, _WEIGHTS
-    )
-    return solve_tracking(problem).trajectory(problem)
-
-
-def _structured_row(case: str, problems: list[TrackingProblem]) -> dict[str, Any]:
-    solve_tracking(problems[0])
-    solutions = [solve_tracking(problem) for problem in problems]
-    active = [int((s.multipliers[:-2] > 1e-6).sum()) if s.iterations else 0 for s in solutions]
-    return {
-        "solver": "structured",
-        "case": case,
-        **timing_summary([s.elapsed_ms for s in solutions]),
-        "solved": sum(s.status is Status.CONVERGED for s in solutions),
-        "infeasible": sum(s.status is Status.INFEASIBLE for s in solutions),
-        "active_rows": float(np.median(active)),
-    }
-
-
-def _peer_row(case: str, name: str, problems: list[TrackingProblem]) -> dict[str, Any]:
-    solve = solver_of(name)
-    if solve is None:
-        return {"solver": name, "case": case, **timing_summary([]), "solved": 0, "note": "not installed"}
-    times, differences = [], []
-    for problem in problems:
-        ours = solve_tracking(problem)
-        x, elapsed = solve(sparse_program(problem))
-        times.append(elapsed)
-        if ours.status is Status.CONVERGED and np.isfinite(x).all():
-            differences.append(float(np.abs(paper_step(problem, ours).ravel() - x).max()))
-    return {
-        "solver": name,
-        "case": case,
-        **timing_summary(times),
-        "solved": len(differences),
-        "difference_median": float(np.median(differences)) if differences else float("nan"),
-    }
 
 
 def _cycle_rows(cell: Cell, cycles: int, seed: int, progress: Callable[[str], None]) -> list[dict[str, Any]]:
@@ -295,9 +204,3 @@ def splice_jump(running: GraspPlan, result: ReplanResult) -> float:
         for part in ("arm", "gripper")
         for name in ("position", "velocity", "acceleration")
     )
-
-
-def _displaced(T: pin.SE3, rng: np.random.Generator, distance: float, degrees: float) -> pin.SE3:
-    heading, turn = rng.uniform(-np.pi, np.pi), np.deg2rad(rng.uniform(-degrees, degrees))
-    offset = rng.uniform(0.0, distance) * np.array([np.cos(heading), np.sin(heading), 0.0])
-    return pin.SE3(pin.utils.rotate("z", turn) @ T.rotation, T.translation + offset)

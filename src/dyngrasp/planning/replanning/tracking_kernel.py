@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
-from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL, interior_point
+from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL
 from dyngrasp.planning.replanning.joint_splines import (
     POSITION,
     RATE,
@@ -20,10 +20,12 @@ from dyngrasp.planning.replanning.joint_splines import (
     plain_taps,
     product,
     pull_back_one,
+    push_forward,
     sequence,
     spread_weights,
     substitute_shared,
 )
+from dyngrasp.planning.replanning.joints_with_rows import solve_joints_with_rows
 from dyngrasp.signals import Array
 
 # A row may be violated by this much of its half-width: a tenth of what the audit forgives as rounding.
@@ -128,7 +130,7 @@ def solve(
             x[i, j] = reference[0][k, j] - h2 / 4 * T_ref * T_ref * reference[2][k, j]
 
     dual, dual_by_T, weight = np.empty((K, n)), np.empty((K, n)), np.empty((K, n))
-    gradient, column, solved = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
+    gradient, column, solved = np.empty((size, n)), np.empty((size, n)), np.zeros((size, n))
     moving_ends = False
     for end in range(2):
         for j in range(n):
@@ -183,11 +185,11 @@ def solve(
     multipliers[:2] = 0.0
     if least < -VIOLATION:
         count = near
-        slope, bands_of_all = np.empty_like(z), np.empty((size, 3, n))
+        slope = np.empty_like(z)
         filtered(r_by_T, slope)
-        for i in range(size):
-            for d in range(3):
-                bands_of_all[i, d] = base[i, d]
+        # Where no row is in the way, T takes everything along with it.
+        along_T, along_T_z = -solved, slope.copy()
+        push_forward(taps, along_T, along_T_z)
         # The cost of moving by what is violated is the scale of a program whose free optimum costs next to nothing.
         cost = _cost(reference, T, T_ref, z, scaled, node_weights, k_first, k_last)
         cost += 0.5 * stiffness_T * (T - T_ref) ** 2
@@ -196,17 +198,19 @@ def solve(
         x_free, z_free, T_free = x.copy(), z.copy(), T
         for attempt in range(3):
             x[:], z[:], T = x_free, z_free, T_free
-            outcome, T, steps, count = interior_point(
+            outcome, T, steps, count = solve_joints_with_rows(
                 codes,
                 count,
                 a_ends,
                 first,
                 taps,
-                bands_of_all,
+                base,
                 column,
+                along_T,
                 corner,
                 g_T,
                 slope,
+                along_T_z,
                 x,
                 T,
                 T_lin,
