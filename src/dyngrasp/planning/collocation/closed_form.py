@@ -61,15 +61,20 @@ def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float)
     """
     motion = np.empty((3, *curvature.shape))
     motion[2] = curvature
-    _meet_ends(problem.intervals, _ends(problem), duration, motion)
+    return _meeting_ends(problem, duration, motion)
+
+
+def _meeting_ends(problem: PhaseProblem, duration: float, motion: Array) -> Trajectory:
+    """`nearest_trajectory` of accelerations in normalised time that are the last part of (3, N+1, n), in their place."""
+    _meet_ends(*_straight(problem.intervals), _ends(problem), duration, motion)
     return Trajectory(duration, *frozen(motion))
 
 
-def _meet_ends(intervals: int, ends: Ends, duration: float, motion: Array) -> None:
-    """Write `nearest_trajectory` (3, N+1, n) in place of the accelerations in normalised time that come last."""
+@lru_cache(maxsize=64)
+def _straight(intervals: int) -> tuple[Array, Array, Array, Array]:
+    """Rows (2, N+1), inverse Gram matrix (2, 2), no shares and no way points of a motion that passes nothing."""
     rows, gram_inverse, shares = _map(intervals, _STRAIGHT)
-    _close(rows[0], gram_inverse[0], shares[0], _NOWHERE, ends, duration, motion[2])
-    _integrate(ends, duration, motion)
+    return rows[0], gram_inverse[0], shares[0], _NOWHERE
 
 
 @njit(cache=True)
@@ -104,7 +109,13 @@ def _changes(shares: Array, waypoints: Array, ends: Ends, joint: int, fixed: Arr
 
 
 @njit(cache=True)
-def _integrate(ends: Ends, duration: float, motion: Array) -> None:
+def _meet_ends(
+    rows: Array, gram_inverse: Array, shares: Array, waypoints: Array, ends: Ends, duration: float, motion: Array
+) -> None:
+    """Write a motion (3, N+1, n) in place of accelerations in normalised time, its last part, as `_close` changes them."""
+    # Way points may follow closely on one another: the second time closes what rounding of the inverse leaves open.
+    for _ in range(2 if shares.size else 1):
+        _close(rows, gram_inverse, shares, waypoints, ends, duration, motion[2])
     start_position, start_velocity, end_position, end_velocity = ends
     position, velocity, acceleration = motion
     half = 0.5 / (len(position) - 1)
@@ -122,13 +133,12 @@ def _integrate(ends: Ends, duration: float, motion: Array) -> None:
 
 def least_effort(problem: PhaseProblem, duration: float) -> Trajectory:
     """The minimiser of Σ|v_k|² for a given duration under the boundary states alone."""
-    return nearest_trajectory(problem, np.zeros((problem.intervals + 1, problem.joints)), duration)
+    return _meeting_ends(problem, duration, np.zeros((3, problem.intervals + 1, problem.joints)))
 
 
 def least_cost(problem: PhaseProblem, duration: float) -> float:
     """J(T) = T + (ρ/N)(c0 T⁻³ + c1 T⁻² + c2 T⁻¹), the objective of `least_effort` (s)."""
-    _, gram_inverse, shares = _map(problem.intervals, _STRAIGHT)
-    c0, c1, c2 = _effort(gram_inverse[0], shares[0], _NOWHERE, _ends(problem))
+    c0, c1, c2 = _effort(*_straight(problem.intervals)[1:], _ends(problem))
     return _cost(c0, c1, c2, problem.effort_weight / problem.intervals, duration)
 
 
@@ -270,9 +280,9 @@ def optimum_through(
     nodes, waypoints = tuple(tuple(row) for row in timetables), read_only(waypoints)
     best, duration, cost = _best(problem, nodes, waypoints)
     rows, gram_inverse, shares = _map(problem.intervals, nodes)
-    curvature = np.zeros((problem.intervals + 1, problem.joints))
-    _close(rows[best], gram_inverse[best], shares[best], waypoints, _ends(problem), duration, curvature)
-    return nearest_trajectory(problem, curvature, duration), cost
+    motion = np.zeros((3, problem.intervals + 1, problem.joints))
+    _meet_ends(rows[best], gram_inverse[best], shares[best], waypoints, _ends(problem), duration, motion)
+    return Trajectory(duration, *frozen(motion)), cost
 
 
 def _reach_row(intervals: int, node: int) -> Array:
@@ -289,7 +299,7 @@ def _reach_row(intervals: int, node: int) -> Array:
 def rest_to_rest(intervals: int) -> tuple[Array, Array, Array]:
     """Position, rate and curvature, each (N+1,), of the least-effort motion from 0 to 1 at rest, in normalised time."""
     zero, one, motion = frozen(np.zeros(1)), frozen(np.ones(1)), np.zeros((3, intervals + 1, 1))
-    _meet_ends(intervals, (zero, zero, one, zero), 1.0, motion)
+    _meet_ends(*_straight(intervals), (zero, zero, one, zero), 1.0, motion)
     position, rate, curvature = motion[..., 0]
     # The motion is odd about its middle; averaging with its mirror image takes the summed rounding out of both ends.
     symmetric_rate = (rate + rate[::-1]) / 2
