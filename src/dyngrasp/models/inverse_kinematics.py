@@ -85,7 +85,7 @@ def joint_velocity(robot: RobotModel, q: ArrayLike, twist_world: ArrayLike, swiv
     if twist.shape != (6,) or not np.isfinite(twist).all() or not math.isfinite(swivel_rate):
         raise InvalidProblem(f"six finite numbers of a twist and a finite swivel rate expected: {twist}, {swivel_rate}")
     rate, missing = robot.flange_chain.least_rates(q, twist) or _least_squares_rates(robot.jacobian(q), twist)
-    if missing > TWIST_TOLERANCE * max(1.0, float(np.linalg.norm(twist))):
+    if missing > TWIST_TOLERANCE * max(1.0, math.hypot(*twist)):
         raise InvalidProblem(
             f"{robot.name} is singular at q = {q.round(4).tolist()}: it cannot move with the twist "
             f"{twist.round(4).tolist()}, {missing:.3g} of it would be missing"

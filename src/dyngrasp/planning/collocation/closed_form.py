@@ -65,7 +65,7 @@ def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float)
 
 
 def _meeting_ends(problem: PhaseProblem, duration: float, motion: Array) -> Trajectory:
-    """`nearest_trajectory` of accelerations in normalised time that are the last part of (3, N+1, n), in their place."""
+    """`nearest_trajectory` in place of its accelerations in normalised time, the last part of (3, N+1, n)."""
     _meet_ends(*_straight(problem.intervals), _ends(problem), duration, motion)
     return Trajectory(duration, *frozen(motion))
 
@@ -112,7 +112,7 @@ def _changes(shares: Array, waypoints: Array, ends: Ends, joint: int, fixed: Arr
 def _meet_ends(
     rows: Array, gram_inverse: Array, shares: Array, waypoints: Array, ends: Ends, duration: float, motion: Array
 ) -> None:
-    """Write a motion (3, N+1, n) in place of accelerations in normalised time, its last part, as `_close` changes them."""
+    """Close the gaps of accelerations in normalised time, the last part of (3, N+1, n), and write the motion there."""
     # Way points may follow closely on one another: the second time closes what rounding of the inverse leaves open.
     for _ in range(2 if shares.size else 1):
         _close(rows, gram_inverse, shares, waypoints, ends, duration, motion[2])

@@ -203,13 +203,12 @@ class PhaseProblems:
     ) -> NodeConstraint:
         """The funnel with its margin, or with what the boundary states leave of it."""
         frames = self._grasp_frames(targets, start_time, targets.grasp_time - targets.grasp_duration)
-        funnel = constraints.funnel(self.task.robot, hand.grasp_points, frames, self.task.grasp_object.funnel)
-        ends = np.vstack([start.position, targets.pregrasp.position])
-        at_ends = np.empty((2, 1))
+        funnel = constraints.funnel(self.task.robot, hand.grasp_points, frames, self.task.grasp_object.funnel, margin)
+        ends, at_ends = np.array([start.position, targets.pregrasp.position]), np.empty((2, 1))
         node_functions(funnel).values(ends, np.zeros_like(ends), funnel.parameters[[0, -1]], at_ends, 0)
         # A little less than the ends have, so that an interior point remains.
-        margin = min(margin, 0.9 * float(at_ends.min()))
-        return replace(funnel, lower=np.array([max(margin, 0.0)]))
+        left = 0.9 * float(at_ends.min())
+        return replace(funnel, lower=np.array([max(left, 0.0)])) if left < margin else funnel
 
     def _tube(self, targets: GraspTargets, hand: HandMotion) -> NodeConstraint:
         settings = self.task.settings
