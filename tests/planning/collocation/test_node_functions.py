@@ -9,8 +9,10 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 
+from dyngrasp.models.pinch import Pinch
 from dyngrasp.planning import constraints
 from dyngrasp.planning.collocation import code_cache, node_functions
 from dyngrasp.planning.collocation.code_cache import COMPILER_VARIABLE, CompilationError
@@ -38,6 +40,14 @@ def needs_compiler():
 @pytest.fixture(scope="module")
 def torque(iiwa):
     return constraints.torque_rows(iiwa, K - 1)
+
+
+@pytest.fixture(scope="module")
+def hold(iiwa):
+    part = pin.Inertia(1.5, np.array([0.01, -0.02, 0.2]), np.diag([0.004, 0.006, 0.005]))
+    T_flange_grasp = pin.SE3(pin.utils.rotate("x", 0.3), np.array([0.0, 0.02, 0.17]))
+    velocity = np.random.default_rng(8).normal(size=(K, 7))
+    return constraints.hold(iiwa, part, T_flange_grasp, Pinch(30.0, 0.5, 0.01, 0.03), velocity)
 
 
 def evaluate(functions, constraint, seed=0, column=2, total=11):
@@ -68,14 +78,17 @@ def test_compiled_and_interpreted_agree(needs_compiler, torque):
 
 
 @pytest.mark.parametrize("kind", [CompiledNodeFunctions, InterpretedNodeFunctions])
-def test_derivatives_are_those_of_the_values(needs_compiler, torque, kind):
-    functions = kind(torque.function, "torque") if kind is CompiledNodeFunctions else kind(torque.function)
-    random = np.random.default_rng(3)
-    u, weights = random.normal(size=(K, 14)), random.normal(size=(7, padded(K)))
-    p, step = torque.parameters, 1e-6
+@pytest.mark.parametrize("name", ["torque", "hold"])
+def test_derivatives_are_those_of_the_values(needs_compiler, name, kind, request):
+    """The Hessian of the torque rows is shorter as a whole, that of the hold rows as a triangle."""
+    constraint = request.getfixturevalue(name)
+    functions = kind(constraint.function, name) if kind is CompiledNodeFunctions else kind(constraint.function)
+    random, rows = np.random.default_rng(3), functions.rows
+    u, weights = random.normal(size=(K, 14)), random.normal(size=(rows, padded(K)))
+    p, step = constraint.parameters, 1e-6
 
     def at(u):
-        g, jacobian, hessian = np.empty((K, 7)), np.empty((7, 14, padded(K))), np.zeros((14, 14, padded(K)))
+        g, jacobian, hessian = np.empty((K, rows)), np.empty((rows, 14, padded(K))), np.zeros((14, 14, padded(K)))
         q, v = np.ascontiguousarray(u[:, :7]), np.ascontiguousarray(u[:, 7:])
         functions.derivatives(q, v, p, weights, g, jacobian, hessian, 0)
         return g, jacobian[:, :, :K], hessian[:, :, :K]

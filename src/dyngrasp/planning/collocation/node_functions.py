@@ -106,10 +106,18 @@ def _expressions(function: ca.Function) -> tuple[ca.Function, ca.Function, NDArr
     u = ca.vertcat(q, v)
     g = ca.densify(function(q, v, p))
     jacobian = ca.jacobian(g, u)
-    hessian, _ = ca.hessian(ca.dot(weights, g), u)
     options = {"cse": True}
     values = ca.Function("values", [q, v, p], [g], options)
-    derivatives = ca.Function("derivatives", [q, v, p, weights], [g, jacobian.T, hessian], options)
+    # A triangle of the Hessian, column by column, or all columns at once: which is shorter depends on the rows.
+    hessian, gradient = ca.hessian(ca.dot(weights, g), u)
+    columns = [ca.vertcat(ca.SX(j, 1), ca.jacobian(gradient[j:], u[j])) for j in range(2 * n)]
+    derivatives = min(
+        (
+            ca.Function("derivatives", [q, v, p, weights], [g, jacobian.T, second], options)
+            for second in (hessian, ca.tril2symm(ca.horzcat(*columns)))
+        ),
+        key=ca.Function.n_instructions,
+    )
     by_acceleration = np.array(ca.DM(function.jac_sparsity(0, 1), 1.0)).reshape(m, n)
     return values, derivatives, np.any(by_acceleration != 0, axis=1)
 
