@@ -43,10 +43,11 @@ __all__ = [
     "ROUNDING",
     "ElbowCircle",
     "SrsChain",
+    "angles_at",
     "arm_angle_of",
     "circle_at",
-    "configurations",
     "joint_vector",
+    "put_on_branch",
 ]
 
 BRANCHES = 8
@@ -255,43 +256,50 @@ def circle_at(R, p, lengths, nearest, farthest):
 
 
 @njit(cache=True, error_model="numpy")
-def configurations(elbow, rotations, psi, branches):
-    """Joint angles (m, b, 7) (rad, whole turns arbitrary) at arm angles psi (m,) on some branches (m, b) of each.
+def angles_at(elbow, rotations, psi, angles):
+    """Write the joint angles (7,) at an arm angle on branch 0; returns whether shoulder and wrist are aligned.
 
     `elbow` and `rotations` are those of the `ElbowCircle`.
     """
-    out = np.empty((psi.size, branches.shape[1], 7))
-    R, first = np.empty(18), np.empty(7)
-    for m in range(psi.size):
-        c, s = np.cos(psi[m]), np.sin(psi[m])
-        for j in range(18):
-            R[j] = c * rotations[0, j] + s * rotations[1, j] + rotations[2, j]
-        shoulder, wrist = _zyz_angles(R[:9], first[:3]), _zyz_angles(R[9:], first[4:])
-        first[3] = elbow
-        for k in range(branches.shape[1]):
-            q, branch = out[m, k], branches[m, k]
-            for i in range(7):
-                q[i] = first[i] * _SIGNS[branch, i] + _TURNS[branch, i]
-            if shoulder:
-                _share_turn(q[:3], first[1])
-            if wrist:
-                _share_turn(q[4:], first[5])
-    return out
+    c, s = np.cos(psi), np.sin(psi)
+    shoulder, wrist = _zyz_angles(rotations, 0, c, s, angles[:3]), _zyz_angles(rotations, 9, c, s, angles[4:])
+    angles[3] = elbow
+    return shoulder, wrist
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def put_on_branch(angles, aligned, branch, q):
+    """Write the joint angles (7,) (rad, whole turns arbitrary) of one branch, given the outcome of `angles_at`."""
+    shoulder, wrist = aligned
+    for i in range(7):
+        q[i] = angles[i] * _SIGNS[branch, i] + _TURNS[branch, i]
+    if shoulder:
+        _share_turn(q[:3], angles[1])
+    if wrist:
+        _share_turn(q[4:], angles[5])
 
 
 @njit(cache=True, error_model="numpy")
-def _zyz_angles(R, out):
-    """Angles (3,) of R = Rz Ry Rz, row-major (9,), the middle one in [0, π]; returns whether that is 0 or π.
+def _zyz_angles(rotations, first, c, s, out):
+    """Angles (3,) of R = Rz Ry Rz, the middle one in [0, π]; returns whether that is 0 or π.
 
-    There the first angle is zero and the third takes all of the turn.
+    R is c and s times two rows of `rotations` and once the third, row by row from column `first` on. Where the middle
+    angle is 0 or π, the first one is zero and the third takes all of the turn.
     """
-    tilt = np.hypot(R[2], R[5])
+    j = first
+    xx = c * rotations[0, j] + s * rotations[1, j] + rotations[2, j]
+    xy = c * rotations[0, j + 1] + s * rotations[1, j + 1] + rotations[2, j + 1]
+    xz = c * rotations[0, j + 2] + s * rotations[1, j + 2] + rotations[2, j + 2]
+    yx = c * rotations[0, j + 3] + s * rotations[1, j + 3] + rotations[2, j + 3]
+    yy = c * rotations[0, j + 4] + s * rotations[1, j + 4] + rotations[2, j + 4]
+    yz = c * rotations[0, j + 5] + s * rotations[1, j + 5] + rotations[2, j + 5]
+    zz = c * rotations[0, j + 8] + s * rotations[1, j + 8] + rotations[2, j + 8]
+    tilt = np.hypot(xz, yz)
     aligned = tilt < ALIGNED
-    first = 0.0 if aligned else np.arctan2(R[5], R[2])
     # cos and sin of the first angle. From the upper two rows instead of the last one, which vanishes with the tilt.
-    c, s = (1.0, 0.0) if aligned else (R[2] / tilt, R[5] / tilt)
-    out[0], out[1] = first, np.arctan2(tilt, R[8])
-    out[2] = np.arctan2(c * R[3] - s * R[0], c * R[4] - s * R[1])
+    cosine, sine = (1.0, 0.0) if aligned else (xz / tilt, yz / tilt)
+    out[0], out[1] = 0.0 if aligned else np.arctan2(yz, xz), np.arctan2(tilt, zz)
+    out[2] = np.arctan2(cosine * yx - sine * xx, cosine * yy - sine * xy)
     return aligned
 
 

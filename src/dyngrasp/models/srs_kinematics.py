@@ -18,7 +18,7 @@ from dyngrasp.errors import InvalidProblem, ModelFileError, OutOfReach
 from dyngrasp.models.srs_chain import BRANCHES, ElbowCircle, SrsChain, joint_vector
 from dyngrasp.models.srs_search import (
     admissible_configurations,
-    configurations_within,
+    configurations_on,
     follow_configuration,
     nearest_configuration,
 )
@@ -151,9 +151,8 @@ class SrsKinematics:
             raise InvalidProblem(f"branch {branch}: an S-R-S arm has branches 0 to {BRANCHES - 1}")
         if not math.isfinite(arm_angle):
             raise InvalidProblem(f"arm angle {arm_angle}: a finite number expected")
-        q, within = self._configurations(self._circle(T_world_flange), np.array([arm_angle]), np.array([[branch]]))
-        q = q[0, 0]
-        if not within[0, 0]:
+        (q,), (within,) = self._configurations(self._circle(T_world_flange), np.array([arm_angle]), branch)
+        if not within:
             lower, upper = self.limits.position_lower, self.limits.position_upper
             worst = int(np.argmax(np.maximum(lower - q, q - upper)))
             raise OutOfReach(
@@ -191,11 +190,10 @@ class SrsKinematics:
             OutOfReach: None exists on the grid.
             InvalidProblem: A pose that is not finite.
         """
-        grid = _grid(arm_angles) if isinstance(arm_angles, int) else np.atleast_1d(np.asarray(arm_angles, dtype=float))
+        grid = _grid(arm_angles) if isinstance(arm_angles, int) else read_only(np.atleast_1d(arm_angles))
         circle, limits = self._circle(T_world_flange), self.limits
         found = admissible_configurations(
-            circle.elbow, circle.rotations, grid, _every_branch(grid.size), self._middle, limits.position_lower,
-            limits.position_upper,
+            circle.elbow, circle.rotations, grid, self._middle, limits.position_lower, limits.position_upper
         )  # fmt: skip
         if len(found[0]) == 0:
             raise self._forbidden(grid.size)
@@ -228,7 +226,7 @@ class SrsKinematics:
         circle, grid = self._circle(T_world_flange), _grid(samples)
 
         def admissible(psi: Array) -> NDArray[np.bool_]:
-            return self._configurations(circle, psi, np.full((psi.size, 1), branch))[1][:, 0]
+            return self._configurations(circle, psi, branch)[1]
 
         inside = admissible(grid)
         if inside.all():
@@ -270,8 +268,8 @@ class SrsKinematics:
         # Intervals narrower than the grid are rare; only where nothing else is left is the finer grid worth its time.
         for size in (ARM_ANGLES, 20 * ARM_ANGLES):
             q, cost = nearest_configuration(
-                circle.elbow, circle.rotations, own + _grid(size), 2.0 * math.pi / size, _every_branch(size),
-                q_reference, weight, self._middle, limits.position_lower, limits.position_upper,
+                circle.elbow, circle.rotations, own + _grid(size), 2.0 * math.pi / size, q_reference, weight,
+                self._middle, limits.position_lower, limits.position_upper,
             )  # fmt: skip
             if math.isfinite(cost):
                 return q
@@ -284,22 +282,12 @@ class SrsKinematics:
     def _circle(self, T_world_flange: pin.SE3) -> ElbowCircle:
         return self._chain.circle(T_world_flange, *self._reach)
 
-    def _configurations(
-        self, circle: ElbowCircle, psi: Array, branches: NDArray[np.int64]
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """`srs_chain.configurations` turned to the middle of the ranges, and whether each keeps the limits, (m, b)."""
+    def _configurations(self, circle: ElbowCircle, psi: Array, branch: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Configurations (m, 7) at arm angles (m,) on one branch, and whether each keeps the limits, (m,)."""
         limits = self.limits
-        return configurations_within(
-            circle.elbow, circle.rotations, psi, branches, self._middle, limits.position_lower, limits.position_upper
+        return configurations_on(
+            branch, circle.elbow, circle.rotations, psi, self._middle, limits.position_lower, limits.position_upper
         )
-
-
-@lru_cache(maxsize=8)
-def _every_branch(count: int) -> NDArray[np.int64]:
-    """All branches, (count, 8)."""
-    branches = np.broadcast_to(np.arange(BRANCHES), (count, BRANCHES)).copy()
-    branches.setflags(write=False)
-    return branches
 
 
 @lru_cache(maxsize=8)
