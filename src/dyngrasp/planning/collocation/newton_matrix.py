@@ -152,7 +152,7 @@ def _constraint_blocks(work: WorkArrays, limits: tuple, omega: Array, curvature:
     for r in range(m):
         if free[r] == 0.0:
             stiffness[r, 0], stiffness[r, K - 1] = 0.0, 0.0
-        for i in range(twice):
+        for i in range(n if free[r] == 0.0 else twice):
             factor, slope, product = stiffness[r], jacobian[r, i], stiff[r, i]
             for k in range(P):
                 product[k] = scale[r] * scale[r] * factor[k] * slope[k]

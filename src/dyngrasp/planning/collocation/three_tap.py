@@ -108,11 +108,12 @@ def expand(tap: ThreeTap, x: Array, duration: float, z: Array) -> None:
     kinds, points, n = z.shape
     for kind in range(kinds):
         for k in range(points):
+            here, constant, rate = z[kind, k], offset[kind, k], slope[kind, k]
+            before, at, after = x[first[k]], x[first[k] + 1], x[first[k] + 2]
+            w_before, w_at, w_after = taps[k, 0, kind], taps[k, 1, kind], taps[k, 2, kind]
             for j in range(n):
-                value = offset[kind, k, j] + duration * slope[kind, k, j]
-                for b in range(TAPS):
-                    value += taps[k, b, kind] * x[first[k] + b, j]
-                z[kind, k, j] = value
+                filtered = w_before * before[j] + w_at * at[j] + w_after * after[j]
+                here[j] = constant[j] + duration * rate[j] + filtered
 
 
 @njit(cache=True)
@@ -132,11 +133,11 @@ def expand_step(tap: ThreeTap, dx: Array, dT: float, dz: Array) -> None:
     kinds, points, n = dz.shape
     for kind in range(kinds):
         for k in range(points):
+            here, rate = dz[kind, k], slope[kind, k]
+            before, at, after = dx[first[k]], dx[first[k] + 1], dx[first[k] + 2]
+            w_before, w_at, w_after = taps[k, 0, kind], taps[k, 1, kind], taps[k, 2, kind]
             for j in range(n):
-                value = dT * slope[kind, k, j]
-                for b in range(TAPS):
-                    value += taps[k, b, kind] * dx[first[k] + b, j]
-                dz[kind, k, j] = value
+                here[j] = dT * rate[j] + w_before * before[j] + w_at * at[j] + w_after * after[j]
 
 
 @njit(cache=True)
@@ -155,12 +156,16 @@ def pull_back(tap: ThreeTap, dual: Array, gradient: Array) -> float:
     kinds, points, n = dual.shape
     gradient[:] = 0.0
     by_duration = 0.0
+    for k in range(points):
+        for b in range(TAPS):
+            q, w, a = taps[k, b, POSITION], taps[k, b, RATE], taps[k, b, CURVATURE]
+            here = gradient[first[k] + b]
+            for j in range(n):
+                here[j] += q * dual[POSITION, k, j] + w * dual[RATE, k, j] + a * dual[CURVATURE, k, j]
     for kind in range(kinds):
         for k in range(points):
-            for b in range(TAPS):
-                weight = taps[k, b, kind]
-                for j in range(n):
-                    gradient[first[k] + b, j] += weight * dual[kind, k, j]
+            if 2 < k < points - 3:
+                continue
             for j in range(n):
                 by_duration += slope[kind, k, j] * dual[kind, k, j]
     return by_duration
