@@ -81,7 +81,7 @@ class Trajectory:
     def sample_as(self, local: float, t: float, at_rest: bool = False) -> JointState:
         """State at `local` (s) under the time `t` (s) of another clock; with velocity and acceleration 0 if at rest."""
         state = np.empty((3, 1, self.position.shape[1]))
-        interpolate(self.duration, self.position, self.velocity, self.acceleration, np.array([local]), state)
+        interpolate(self.arrays, np.array([local]), state)
         if at_rest:
             state[1:] = 0.0
         return JointState(t, *frozen(state)[:, 0])
@@ -102,13 +102,13 @@ class Trajectory:
         """
         times = np.asarray(times, dtype=float)
         out = np.empty((3, times.size, self.position.shape[1]))
-        interpolate(self.duration, self.position, self.velocity, self.acceleration, times, out)
+        interpolate(self.arrays, times, out)
         q, w, v = frozen(out)
         return q, w, v
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
-        return largest_defect(self.duration, self.position, self.velocity, self.acceleration)
+        return largest_defect(self.arrays)
 
 
 @njit(cache=True)
@@ -143,8 +143,9 @@ def _all_finite(position, velocity, acceleration):
 
 
 @njit(cache=True, error_model="numpy")
-def interpolate(duration, position, velocity, acceleration, times, out):
+def interpolate(trajectory, times, out):
     """`Trajectory.sample_many` (3, M, n); compiled, for controllers and audits ask for little and often."""
+    duration, position, velocity, acceleration = trajectory
     N, n = position.shape[0] - 1, position.shape[1]
     step = duration / N
     for m in range(times.size):
@@ -167,8 +168,9 @@ def interpolate(duration, position, velocity, acceleration, times, out):
 
 
 @njit(cache=True, error_model="numpy")
-def largest_defect(duration, position, velocity, acceleration):
+def largest_defect(trajectory):
     """`Trajectory.dynamics_defect`."""
+    duration, position, velocity, acceleration = trajectory
     half_step, n = duration / (position.shape[0] - 1) / 2, position.shape[1]
     q, w, v = position.ravel(), velocity.ravel(), acceleration.ravel()
     return max(_violation(half_step, q[:-n], q[n:], w[:-n], w[n:]), _violation(half_step, w[:-n], w[n:], v[:-n], v[n:]))

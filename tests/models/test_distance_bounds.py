@@ -15,7 +15,7 @@ from dyngrasp.models.distance_bounds import (
     pieces_near_ground,
     tighten,
 )
-from dyngrasp.models.link_motion import follow, seen_from
+from dyngrasp.models.link_motion import Motion, follow, seen_from
 
 GJK = 1e-6  # m, tolerance of Coal's iterations
 
@@ -117,9 +117,9 @@ def test_bounds_to_pieces_and_their_neighbours(name, seed):
     half = random.uniform(0.02, 0.08, (2, 3))
     centres = random.normal(size=(2, 3)) * 0.03
     pieces = boxes_around([centres[i] + np.vstack([-half[i], half[i]]) for i in range(2)], 7)
-    seen = follow(*seen_from(R[-1], p[-1], R, p), np.vstack([bodies.link_ends.mean(axis=1)]))
+    seen = Motion(*follow(*seen_from(R[-1], p[-1], R, p), np.vstack([bodies.link_ends.mean(axis=1)])))
     start, stop = 3, samples - 4
-    found = near_pieces(seen, bodies, pieces, np.array([start, samples]), np.array([stop, samples]), horizon)
+    found = near_pieces(seen, bodies, pieces, np.array([[start, stop], [samples, samples]]), horizon)
     exact = {
         (0, 7 + i): np.array(
             [
@@ -139,9 +139,8 @@ def test_bounds_to_pieces_and_their_neighbours(name, seed):
         for k in (start, (start + stop) // 2):
             bounds, at = np.full(samples, -np.inf), np.arange(samples)
             least = tighten(
-                at, bounds, seen.shift[1], seen.turn[1], bodies.reaches[0],
-                seen.shift[2], seen.turn[2], pieces.reaches[pair[1] - 7], k, distances[k],
-            )  # fmt: skip
+                at, bounds, seen.path(1, bodies.reaches[0]), seen.path(2, pieces.reaches[pair[1] - 7]), k, distances[k]
+            )
             others = np.delete(at, k)
             assert np.isposinf(bounds[k])
             assert (bounds[others] <= distances[others] + 2 * GJK).all()
@@ -155,7 +154,7 @@ def test_bounds_between_capsules_are_exact_where_they_are_apart(seed):
     motions = [still(samples), *(walk(random, samples, 0.15) for _ in range(3))]
     shapes, links = [SHAPES[name] for name in ("capsule", "sphere", "cylinder", "convex")], [1, 2, 3, 3]
     bodies, R, p, placed = on_links(shapes, links, motions)
-    world = follow(R, p, bodies.link_ends.mean(axis=1))
+    world = Motion(*follow(R, p, bodies.link_ends.mean(axis=1)))
     found = near_each_other(world, bodies, np.array([[1, 2], [1, 3], [2, 3]]), horizon)
     exact = {
         (i, j): np.array([distance(shapes[i], placed[i][k], shapes[j], placed[j][k]) for k in range(samples)])
@@ -183,7 +182,7 @@ def test_parallel_and_crossing_segments():
             shapes, placements = [rod, shape], [pin.SE3(along, np.zeros(3)), placement]
             bodies = bounding_bodies([shapes[i] for i in pair], [placements[i] for i in pair], np.array([0, 1]), 2)
             R, p = (np.stack(column) for column in zip(arrays(still(1)), arrays(still(1)), strict=True))
-            found = near_each_other(follow(R, p, np.zeros((2, 3))), bodies, np.array([[0, 1]]), 10.0)
+            found = near_each_other(Motion(*follow(R, p, np.zeros((2, 3)))), bodies, np.array([[0, 1]]), 10.0)
             np.testing.assert_allclose(found.bounds, expected, atol=3 * thin)
 
 
@@ -193,7 +192,7 @@ def test_heights_are_those_of_the_lowest_points():
     motions = [still(samples), walk(random, samples, 0.3), walk(random, samples, 0.2)]
     bodies, R, p, placed = on_links([SHAPES["capsule"], SHAPES["box"]], [1, 1], motions)
     ground = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-    world = follow(R, p, bodies.link_ends.mean(axis=1))
+    world = Motion(*follow(R, p, bodies.link_ends.mean(axis=1)))
     shapes, everywhere = [SHAPES["capsule"], SHAPES["box"]], np.ones(samples, dtype=bool)
     exact = {
         (i, -1): np.array([distance(shapes[i], T, ground, pin.SE3.Identity()) for T in placed[i]]) for i in range(2)

@@ -147,7 +147,7 @@ def test_a_moving_part_is_followed(plan, targets, task):
     times = np.array([0.0, 1.3, 2.0, 2.5])
     for part in (moving, replace(moving, twist_world=np.array([0.1, 0, 0, 0, 0, 0])), targets):
         R, p = np.empty((3, 3, 4)), np.empty((3, 4))
-        part_poses(*part_motion(part), times, R, p)
+        part_poses(part_motion(part), times, R, p)
         for k, t in enumerate(times):
             expected = part.T_world_object_at(t)
             np.testing.assert_allclose(R[..., k], expected.rotation, atol=1e-14)

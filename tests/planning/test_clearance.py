@@ -125,8 +125,8 @@ def test_entry_says_where_and_who(task, targets, plan):
             # The part, at a join, still stands or already hangs.
             for lifted in (0, 1):
                 single = Waypoints(waypoints.times[[k]], waypoints.q[:, [k]], waypoints.q_h[:, [k]], 0, lifted)
-                poses = cell.poses(single, part_motion(targets))
-                at.append(cell.distance(cell.names.index(one), cell.names.index(other), *poses, 0))
+                world, _, _ = cell.motions(single, part_motion(targets))
+                at.append(cell.distance(cell.names.index(one), cell.names.index(other), world.R, world.p, 0))
         assert np.abs(np.array(at) - entry.worst).min() < 2 * RESOLUTION
 
 
@@ -145,13 +145,13 @@ def test_distances_are_mujocos(task, targets):
         q = random.uniform(limits.position_lower, limits.position_upper)
         data.qpos[:] = q
         mujoco.mj_forward(model, data)
-        poses = cell.poses(at_once(q, task), part_motion(targets))
+        world, _, _ = cell.motions(at_once(q, task), part_motion(targets))
         for i, j in itertools.combinations(arm, 2):
             expected = mujoco.mj_geomDistance(model, data, names[cell.names[i]], names[cell.names[j]], 2.0, None)
             if expected > 0:
                 apart += 1
                 # MuJoCo's own iterations stop at 1e-6.
-                assert cell.distance(i, j, *poses, 0) == pytest.approx(expected, abs=5e-6), (
+                assert cell.distance(i, j, world.R, world.p, 0) == pytest.approx(expected, abs=5e-6), (
                     cell.names[i],
                     cell.names[j],
                 )
@@ -164,11 +164,11 @@ def test_pieces_and_ground_where_the_answer_is_known(task, targets):
     random = np.random.default_rng(1)
     for _ in range(5):
         T = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.2)
-        poses = cell.poses(at_once(task.place, task), part_motion(replace(targets, T_world_object=T)))
+        world, _, _ = cell.motions(at_once(task.place, task), part_motion(replace(targets, T_world_object=T)))
         for i, path in enumerate(task.grasp_object.piece_paths):
             vertices = np.asarray(trimesh.load_mesh(path).vertices)
             expected = (vertices @ T.rotation.T + T.translation)[:, 2].min()
-            found = cell.distance(cell.first_piece + i, cell.ground, *poses, 0)
+            found = cell.distance(cell.first_piece + i, cell.ground, world.R, world.p, 0)
             assert found == pytest.approx(expected, abs=1e-7)
 
 

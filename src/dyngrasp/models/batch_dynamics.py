@@ -111,11 +111,11 @@ class BatchModel:
 
     def poses(self, q: Array, frames: Attachments) -> tuple[Array, Array]:
         """Poses of K frames in the world: rotations (K, 3, 3, M), positions (K, 3, M) for q (n, M)."""
-        return frame_poses(*cosine_sine(q), *self.tree, *frames.arrays)
+        return frame_poses(q, self.tree, frames.arrays)
 
     def link_poses(self, q: Array, R: Array, p: Array) -> None:
         """Write the poses of all turned joint frames in the world into R (n, 3, 3, M) and p (n, 3, M), for q (n, M)."""
-        link_poses(*cosine_sine(q), *self.tree, R, p)
+        link_poses(q, self.tree, R, p)
 
     def inverse_dynamics(self, q: Array, w: Array, v: Array) -> tuple[Array, Array]:
         """Recursive Newton-Euler for a chain (each joint on the link before it); q, w, v (n, M).
@@ -124,7 +124,7 @@ class BatchModel:
             Torques (n, M) with gravity and armature (Nm), and the motion of the last link in its turned frame, (9, M):
             angular velocity, angular acceleration, and acceleration of the joint's origin less gravity (m/s²).
         """
-        return newton_euler(*cosine_sine(q), w, v, *self.chain)
+        return newton_euler(q, w, v, self.chain)
 
 
 def wrench_on(body: pin.Inertia, motion: Array) -> Array:
@@ -188,9 +188,22 @@ def cosine_sine(angles):
     return cosine, sine
 
 
+@njit(cache=True)
+def side_by_side(q, q_h, arm_indices, hand_indices):
+    """Configurations (n + m, M) of a tree for arm (n, M) and gripper (m, M) positions, by where their joints are."""
+    both = np.empty((arm_indices.size + hand_indices.size, q.shape[1]))
+    for i in range(arm_indices.size):
+        both[arm_indices[i]] = q[i]
+    for i in range(hand_indices.size):
+        both[hand_indices[i]] = q_h[i]
+    return both
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def link_poses(cosine, sine, parents, rotations, offsets, R, p):
-    n, samples = cosine.shape
+def link_poses(q, tree, R, p):
+    """`BatchModel.link_poses` for its `tree`."""
+    (cosine, sine), (parents, rotations, offsets) = cosine_sine(q), tree
+    n, samples = q.shape
     for i in range(n):
         fixed, offset = rotations[i], offsets[i]
         if parents[i] < 0:
@@ -207,13 +220,13 @@ def link_poses(cosine, sine, parents, rotations, offsets, R, p):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def frame_poses(cosine, sine, parents, rotations, offsets, links, link_rotations, link_positions):
-    n, samples = cosine.shape
+def frame_poses(q, tree, frames):
+    """`BatchModel.poses` for its `tree` and the arrays of frames."""
+    (n, samples), (links, link_rotations, link_positions) = q.shape, frames
     R, p = np.empty((n, 3, 3, samples)), np.empty((n, 3, samples))
-    link_poses(cosine, sine, parents, rotations, offsets, R, p)
-    frames = links.size
-    out_R, out_p = np.empty((frames, 3, 3, samples)), np.empty((frames, 3, samples))
-    for f in range(frames):
+    link_poses(q, tree, R, p)
+    out_R, out_p = np.empty((links.size, 3, 3, samples)), np.empty((links.size, 3, samples))
+    for f in range(links.size):
         if links[f] < 0:
             for a in range(3):
                 out_p[f, a] = link_positions[f, a]
@@ -239,55 +252,60 @@ def compose(R, p, turn, shift, out_R, out_p):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def newton_euler(cosine, sine, w, v, rotations, offsets, mass, first_moment, inertia, armature, gravity):
-    n, samples = cosine.shape
-    E, wrench = np.empty((n, 3, 3, samples)), np.empty((n, 6, samples))
+def newton_euler(q, w, v, chain):
+    """`BatchModel.inverse_dynamics` for its `chain`."""
+    rotations, offsets, mass, first_moment, inertia, armature, gravity = chain
+    (n, samples), (cosine, sine) = q.shape, cosine_sine(q)
+    torque, wrench = np.empty((n, samples)), np.empty((n, 6, samples))
     motion, moved = np.zeros((9, samples)), np.empty((9, samples))
     # Lifting the base with −g stands for gravity on every link.
     for a in range(3):
         motion[6 + a] = -gravity[a]
     for i in range(n):
-        for a in range(3):
-            x, y = rotations[i, a, 0], rotations[i, a, 1]
-            E[i, a, 2] = rotations[i, a, 2]
-            for s in range(samples):
-                E[i, a, 0, s] = cosine[i, s] * x + sine[i, s] * y
-                E[i, a, 1, s] = cosine[i, s] * y - sine[i, s] * x
-        _to_child(E[i], offsets[i], w[i], v[i], motion, moved)
+        _to_child(cosine[i], sine[i], rotations[i], offsets[i], w[i], v[i], motion, moved)
         motion, moved = moved, motion
         newton(mass[i], first_moment[i], inertia[i], motion, wrench[i])
-    torque = np.empty((n, samples))
     for i in range(n - 1, -1, -1):
         for s in range(samples):
             torque[i, s] = wrench[i, 5, s] + armature[i] * v[i, s]
         if i > 0:
-            _to_parent(E[i], offsets[i], wrench[i], wrench[i - 1])
+            _to_parent(cosine[i], sine[i], rotations[i], offsets[i], wrench[i], wrench[i - 1])
     return torque, motion
 
 
+@njit(cache=True, inline="always")
+def _turned(c, s, x, y):
+    """One row of the rotation E = fixed · Rot_z of a joint, its first two elements; the third is that of `fixed`."""
+    return c * x + s * y, c * y - s * x
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _to_child(E, offset, rate, acceleration, motion, out):
+def _to_child(cosine, sine, fixed, offset, rate, acceleration, motion, out):
     """Angular velocity o, angular acceleration l, acceleration a of the next link, each in its own frame.
 
     o' = Eᵀ o + z ω,  l' = Eᵀ l + Eᵀ o × z ω + z v,  a' = Eᵀ (a + l × r + o × (o × r)).
     """
-    rx, ry, rz = offset
+    (rx, ry, rz), (fxx, fyx, zx), (fxy, fyy, zy), (fxz, fyz, zz) = offset, fixed[0], fixed[1], fixed[2]
+    # Two loops: one that writes nine rows does not become vector instructions, for all might overlap.
     for s in range(rate.size):
+        c, d = cosine[s], sine[s]
+        (xx, yx), (xy, yy), (xz, yz) = _turned(c, d, fxx, fyx), _turned(c, d, fxy, fyy), _turned(c, d, fxz, fyz)
+        ox, oy, oz, lx, ly, lz = motion[0, s], motion[1, s], motion[2, s], motion[3, s], motion[4, s], motion[5, s]
+        tx, ty = xx * ox + xy * oy + xz * oz, yx * ox + yy * oy + yz * oz
+        out[0, s], out[1, s], out[2, s] = tx, ty, zx * ox + zy * oy + zz * oz + rate[s]
+        out[3, s] = xx * lx + xy * ly + xz * lz + ty * rate[s]
+        out[4, s] = yx * lx + yy * ly + yz * lz - tx * rate[s]
+        out[5, s] = zx * lx + zy * ly + zz * lz + acceleration[s]
+    for s in range(rate.size):
+        c, d = cosine[s], sine[s]
+        (xx, yx), (xy, yy), (xz, yz) = _turned(c, d, fxx, fyx), _turned(c, d, fxy, fyy), _turned(c, d, fxz, fyz)
         ox, oy, oz, lx, ly, lz = motion[0, s], motion[1, s], motion[2, s], motion[3, s], motion[4, s], motion[5, s]
         ux, uy, uz = oy * rz - oz * ry, oz * rx - ox * rz, ox * ry - oy * rx
         ax = motion[6, s] + ly * rz - lz * ry + oy * uz - oz * uy
         ay = motion[7, s] + lz * rx - lx * rz + oz * ux - ox * uz
         az = motion[8, s] + lx * ry - ly * rx + ox * uy - oy * ux
-        tx = E[0, 0, s] * ox + E[1, 0, s] * oy + E[2, 0, s] * oz
-        ty = E[0, 1, s] * ox + E[1, 1, s] * oy + E[2, 1, s] * oz
-        out[0, s], out[1, s] = tx, ty
-        out[2, s] = E[0, 2, s] * ox + E[1, 2, s] * oy + E[2, 2, s] * oz + rate[s]
-        out[3, s] = E[0, 0, s] * lx + E[1, 0, s] * ly + E[2, 0, s] * lz + ty * rate[s]
-        out[4, s] = E[0, 1, s] * lx + E[1, 1, s] * ly + E[2, 1, s] * lz - tx * rate[s]
-        out[5, s] = E[0, 2, s] * lx + E[1, 2, s] * ly + E[2, 2, s] * lz + acceleration[s]
-        out[6, s] = E[0, 0, s] * ax + E[1, 0, s] * ay + E[2, 0, s] * az
-        out[7, s] = E[0, 1, s] * ax + E[1, 1, s] * ay + E[2, 1, s] * az
-        out[8, s] = E[0, 2, s] * ax + E[1, 2, s] * ay + E[2, 2, s] * az
+        out[6, s], out[7, s] = xx * ax + xy * ay + xz * az, yx * ax + yy * ay + yz * az
+        out[8, s] = zx * ax + zy * ay + zz * az
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -312,20 +330,20 @@ def newton(mass, h, inertia, motion, out):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _to_parent(E, offset, wrench, out):
+def _to_parent(cosine, sine, fixed, offset, wrench, out):
     """Add a wrench about a joint's origin to that about its parent's: f += E f', n += E n' + r × E f'."""
-    rx, ry, rz = offset
-    for s in range(wrench.shape[1]):
+    (rx, ry, rz), (fxx, fyx, zx), (fxy, fyy, zy), (fxz, fyz, zz) = offset, fixed[0], fixed[1], fixed[2]
+    for s in range(cosine.size):
+        c, d = cosine[s], sine[s]
+        (xx, yx), (xy, yy), (xz, yz) = _turned(c, d, fxx, fyx), _turned(c, d, fxy, fyy), _turned(c, d, fxz, fyz)
         gx, gy, gz, mx, my, mz = wrench[0, s], wrench[1, s], wrench[2, s], wrench[3, s], wrench[4, s], wrench[5, s]
-        fx = E[0, 0, s] * gx + E[0, 1, s] * gy + E[0, 2, s] * gz
-        fy = E[1, 0, s] * gx + E[1, 1, s] * gy + E[1, 2, s] * gz
-        fz = E[2, 0, s] * gx + E[2, 1, s] * gy + E[2, 2, s] * gz
+        fx, fy, fz = xx * gx + yx * gy + zx * gz, xy * gx + yy * gy + zy * gz, xz * gx + yz * gy + zz * gz
         out[0, s] += fx
         out[1, s] += fy
         out[2, s] += fz
-        out[3, s] += E[0, 0, s] * mx + E[0, 1, s] * my + E[0, 2, s] * mz + ry * fz - rz * fy
-        out[4, s] += E[1, 0, s] * mx + E[1, 1, s] * my + E[1, 2, s] * mz + rz * fx - rx * fz
-        out[5, s] += E[2, 0, s] * mx + E[2, 1, s] * my + E[2, 2, s] * mz + rx * fy - ry * fx
+        out[3, s] += xx * mx + yx * my + zx * mz + ry * fz - rz * fy
+        out[4, s] += xy * mx + yy * my + zy * mz + rz * fx - rx * fz
+        out[5, s] += xz * mx + yz * my + zz * mz + rx * fy - ry * fx
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})

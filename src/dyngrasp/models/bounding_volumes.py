@@ -150,6 +150,45 @@ def _around(points: Array, radii: Array) -> tuple[Array, float]:
 
 
 @njit(cache=True, error_model="numpy", inline="always")
+def point_at(R, p, point, s):
+    """A point (3,) that a link (3, 3, S), (3, S) carries, at sample s (m)."""
+    x, y, z = point[0], point[1], point[2]
+    return (
+        p[0, s] + R[0, 0, s] * x + R[0, 1, s] * y + R[0, 2, s] * z,
+        p[1, s] + R[1, 0, s] * x + R[1, 1, s] * y + R[1, 2, s] * z,
+        p[2, s] + R[2, 0, s] * x + R[2, 1, s] * y + R[2, 2, s] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def lower_end(R, p, ends, s):
+    """Height (m) of the lower end of a segment (2, 3) that a link carries, at sample s."""
+    x, y, z = R[2, 0, s], R[2, 1, s], R[2, 2, s]
+    one = x * ends[0, 0] + y * ends[0, 1] + z * ends[0, 2]
+    other = x * ends[1, 0] + y * ends[1, 1] + z * ends[1, 2]
+    return p[2, s] + min(one, other)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def lowest_corner(R, p, low, high, s):
+    """Height (m) of the lowest corner of a box that a link carries, at sample s; corners in the frame of the link."""
+    z = p[2, s]
+    for a in range(3):
+        z += min(R[2, a, s] * low[a], R[2, a, s] * high[a])
+    return z
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def segment_gap(R, p, ends, s, low, high):
+    """Distance (m) of a box from the one along the same axes around a segment on a link; −inf if they overlap."""
+    gap, one, other = 0.0, point_at(R, p, ends[0], s), point_at(R, p, ends[1], s)
+    for a in range(3):
+        d = max(low[a] - max(one[a], other[a]), min(one[a], other[a]) - high[a], 0.0)
+        gap += d * d
+    return np.sqrt(gap) if gap > 0.0 else -np.inf
+
+
+@njit(cache=True, error_model="numpy", inline="always")
 def gap(low, high, s, other_low, other_high):
     """Distance of two boxes along the axes, the first at sample s; −inf if they overlap."""
     gap = 0.0
@@ -161,21 +200,14 @@ def gap(low, high, s, other_low, other_high):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def lowest_corner(up, origin, low, high, s):
-    """Height of the lowest corner of a box at sample s: world's z axis (3, S) in its frame, height of its origin."""
-    z = origin[s]
-    for a in range(3):
-        z += min(up[a, s] * low[a], up[a, s] * high[a])
-    return z
-
-
-@njit(cache=True, error_model="numpy")
-def segment_distance(one, other, s):
-    """Distance of two segments (2, 3, S) at sample s: where the lines come nearest, each parameter clamped in turn."""
-    px, py, pz = one[0, 0, s], one[0, 1, s], one[0, 2, s]
-    ux, uy, uz = one[1, 0, s] - px, one[1, 1, s] - py, one[1, 2, s] - pz
-    qx, qy, qz = other[0, 0, s], other[0, 1, s], other[0, 2, s]
-    vx, vy, vz = other[1, 0, s] - qx, other[1, 1, s] - qy, other[1, 2, s] - qz
+def segment_distance(R, p, ends, other_R, other_p, other_ends, s):
+    """Distance of two segments (2, 3) on two links at sample s: where the lines come nearest, clamped in turn."""
+    px, py, pz = point_at(R, p, ends[0], s)
+    ux, uy, uz = point_at(R, p, ends[1], s)
+    ux, uy, uz = ux - px, uy - py, uz - pz
+    qx, qy, qz = point_at(other_R, other_p, other_ends[0], s)
+    vx, vy, vz = point_at(other_R, other_p, other_ends[1], s)
+    vx, vy, vz = vx - qx, vy - qy, vz - qz
     wx, wy, wz = px - qx, py - qy, pz - qz
     a, e = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
     b, c, f = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz

@@ -16,8 +16,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dyngrasp.models.bounding_volumes import Bodies, Pieces, gap, lowest_corner, segment_distance
-from dyngrasp.models.link_motion import Motion, next_beyond, path_of, placed, span
+from dyngrasp.models.bounding_volumes import (
+    Bodies,
+    Pieces,
+    gap,
+    lower_end,
+    lowest_corner,
+    segment_distance,
+    segment_gap,
+)
+from dyngrasp.models.link_motion import Motion, next_beyond, paths_of, span, write_path
 from dyngrasp.signals import Array
 
 
@@ -54,14 +62,14 @@ def pieces_near_ground(motion: Motion, pieces: Pieces, start: int, horizon: floa
     """Pieces of the last link that may be lower than `horizon` (m) from sample `start` on; the ground is number −1."""
     return Candidates(
         *_pieces_near_ground(
-            motion.R[-1, 2], motion.p[-1, 2], motion.shift[-1], motion.turn[-1], pieces.low, pieces.high,
+            motion.R[-1], motion.p[-1], motion.shift[-1], motion.turn[-1], pieces.low, pieces.high,
             pieces.around, pieces.reaches, pieces.first, start, horizon,
         )
     )  # fmt: skip
 
 
 def near_pieces(
-    motion: Motion, bodies: Bodies, pieces: Pieces, starts: NDArray[np.int64], stops: NDArray[np.int64], horizon: float
+    motion: Motion, bodies: Bodies, pieces: Pieces, windows: NDArray[np.int64], horizon: float
 ) -> Candidates:
     """Bodies that may come nearer than `horizon` to pieces.
 
@@ -69,15 +77,14 @@ def near_pieces(
         motion: As seen from the part.
         bodies: Volumes around the bodies.
         pieces: Boxes around the pieces.
-        starts: (B,) first sample that counts for each body.
-        stops: (B,) one after the last.
+        windows: (B, 2) first sample that counts for each body, and one after the last.
         horizon: m.
     """
     return Candidates(
         *_near_pieces(
             motion.R, motion.p, motion.shift, motion.turn, bodies.members, bodies.firsts, bodies.ends, bodies.halves,
             bodies.rounding, bodies.reaches, bodies.link_ends, bodies.link_radii, bodies.link_reaches,
-            pieces.low, pieces.high, pieces.around, pieces.first, starts, stops, horizon,
+            pieces.low, pieces.high, pieces.around, pieces.first, windows, horizon,
         )
     )  # fmt: skip
 
@@ -100,24 +107,23 @@ def _near_ground(
     samples = p.shape[2]
     pairs, stops, at, bounds = _space(radii.size, samples)
     n = e = 0
+    paths, path = paths_of(shift, turn, link_reaches), np.empty(samples)
     for k in range(1, link_radii.size):
         if firsts[k] == firsts[k + 1]:
             continue
-        segment, path = placed(R[k], p[k], link_ends[k]), path_of(shift[k], turn[k], link_reaches[k])
         begin = 0
         while begin < samples:
-            bound = min(segment[0, 2, begin], segment[1, 2, begin]) - link_radii[k]
+            bound = lower_end(R[k], p[k], link_ends[k], begin) - link_radii[k]
             if bound < horizon:
                 break
-            begin = next_beyond(path, begin, samples, bound - horizon)
+            begin = next_beyond(paths[k], begin, samples, bound - horizon)
         if begin >= samples:
             continue
         for m in range(firsts[k], firsts[k + 1]):
-            b = members[m]
-            segment, path = placed(R[k], p[k], ends[b]), path_of(shift[k], turn[k], reaches[b])
-            s = begin
+            b, s = members[m], begin
+            write_path(shift[k], turn[k], reaches[b], path)
             while s < samples:
-                bound = min(segment[0, 2, s], segment[1, 2, s]) - radii[b]
+                bound = lower_end(R[k], p[k], ends[b], s) - radii[b]
                 if bound < horizon:
                     at[e], bounds[e] = s, bound
                     e += 1
@@ -127,25 +133,24 @@ def _near_ground(
 
 
 @njit(cache=True, error_model="numpy")
-def _pieces_near_ground(up, origin, shift, turn, low, high, around, reaches, number, start, horizon):
-    """The arrays of `Candidates`: lowest corners of boxes, first the one around all pieces.
-
-    `up` (3, S) and `origin` (S,) are the third row of the pose of their link: what gives heights (m).
-    """
-    samples = origin.size
+def _pieces_near_ground(R, p, shift, turn, low, high, around, reaches, number, start, horizon):
+    """The arrays of `Candidates`: lowest corners of boxes, first the one around all pieces."""
+    samples = p.shape[1]
     pairs, stops, at, bounds = _space(reaches.size, samples)
     n = e = 0
-    path, begin = path_of(shift, turn, reaches.max()), start
+    path, begin = np.empty(samples), start
+    write_path(shift, turn, reaches.max(), path)
     while begin < samples:
-        bound = lowest_corner(up, origin, around[0], around[1], begin)
+        bound = lowest_corner(R, p, around[0], around[1], begin)
         if bound < horizon:
             break
         begin = next_beyond(path, begin, samples, bound - horizon)
     if begin < samples:
         for i in range(reaches.size):
-            path, s = path_of(shift, turn, reaches[i]), begin
+            write_path(shift, turn, reaches[i], path)
+            s = begin
             while s < samples:
-                bound = lowest_corner(up, origin, low[i], high[i], s)
+                bound = lowest_corner(R, p, low[i], high[i], s)
                 if bound < horizon:
                     at[e], bounds[e] = s, bound
                     e += 1
@@ -157,7 +162,7 @@ def _pieces_near_ground(up, origin, shift, turn, low, high, around, reaches, num
 @njit(cache=True, error_model="numpy")
 def _near_pieces(
     R, p, shift, turn, members, firsts, ends, halves, rounding, reaches, link_ends, link_radii, link_reaches,
-    low, high, around, number, starts, lasts, horizon,
+    low, high, around, number, windows, horizon,
 ):  # fmt: skip
     """The arrays of `Candidates`: gaps between boxes along the axes of the part.
 
@@ -167,33 +172,29 @@ def _near_pieces(
     samples, count = p.shape[2], low.shape[0]
     pairs, stops, at, bounds = _space(reaches.size * count, samples)
     n = e = 0
-    own_low, own_high, half = np.empty((3, samples)), np.empty((3, samples)), np.zeros((3, 3))
+    paths, path = paths_of(shift, turn, link_reaches), np.empty(samples)
+    own_low, own_high = np.empty((3, samples)), np.empty((3, samples))
     for k in range(link_radii.size):
         begin, end = samples, 0
         for m in range(firsts[k], firsts[k + 1]):
             b = members[m]
-            if starts[b] < lasts[b]:
-                begin, end = min(begin, starts[b]), max(end, lasts[b])
-        if begin >= end:
-            continue
-        for a in range(3):
-            half[0, a] = (link_ends[k, 1, a] - link_ends[k, 0, a]) / 2
-        span(R[k], p[k], link_ends[k], half, own_low, own_high, begin, end)
-        path = path_of(shift[k], turn[k], link_reaches[k])
+            if windows[b, 0] < windows[b, 1]:
+                begin, end = min(begin, windows[b, 0]), max(end, windows[b, 1])
         while begin < end:
-            bound = gap(own_low, own_high, begin, around[0], around[1]) - link_radii[k]
+            bound = segment_gap(R[k], p[k], link_ends[k], begin, around[0], around[1]) - link_radii[k]
             if bound < horizon:
                 break
-            begin = next_beyond(path, begin, end, bound - horizon)
+            begin = next_beyond(paths[k], begin, end, bound - horizon)
         if begin >= end:
             continue
         for m in range(firsts[k], firsts[k + 1]):
             b = members[m]
-            first, last = max(begin, starts[b]), lasts[b]
+            first, last = max(begin, windows[b, 0]), windows[b, 1]
             if first >= last:
                 continue
+            # Against so many pieces nearly every sample is looked at.
             span(R[k], p[k], ends[b], halves[b], own_low, own_high, first, last)
-            path = path_of(shift[k], turn[k], reaches[b])
+            write_path(shift[k], turn[k], reaches[b], path)
             while first < last:
                 bound = gap(own_low, own_high, first, around[0], around[1]) - rounding[b]
                 if bound < horizon:
@@ -218,47 +219,41 @@ def _near_each_other(
     R, p, shift, turn, members, firsts, ends, radii, reaches, link_ends, link_radii, link_reaches, link_pairs, horizon
 ):
     """The arrays of `Candidates`: distances of capsules: of two links, then of a body and a link, then of bodies."""
-    samples, links = p.shape[2], link_radii.size
+    samples = p.shape[2]
     pairs, stops, at, bounds = _space(radii.size**2 // 2, samples)
     n = e = 0
-    around, paths = np.empty((links, 2, 3, samples)), np.empty((links, samples))
-    for k in range(links):
-        if firsts[k] < firsts[k + 1]:
-            around[k], paths[k] = placed(R[k], p[k], link_ends[k]), path_of(shift[k], turn[k], link_reaches[k])
-    path = np.empty(samples)
+    paths, own, path = paths_of(shift, turn, link_reaches), np.empty(samples), np.empty(samples)
     for q in range(link_pairs.shape[0]):
         j, k = link_pairs[q, 0], link_pairs[q, 1]
-        for s in range(samples):
-            path[s] = paths[j, s] + paths[k, s]
+        _add(paths[j], paths[k], path)
         begin = 0
         while begin < samples:
-            bound = segment_distance(around[j], around[k], begin) - link_radii[j] - link_radii[k]
+            apart = segment_distance(R[j], p[j], link_ends[j], R[k], p[k], link_ends[k], begin)
+            bound = apart - link_radii[j] - link_radii[k]
             if bound < horizon:
                 break
             begin = next_beyond(path, begin, samples, bound - horizon)
         if begin >= samples:
             continue
         for o in range(firsts[j], firsts[j + 1]):
-            b = members[o]
-            one, own = placed(R[j], p[j], ends[b]), path_of(shift[j], turn[j], reaches[b])
-            first = begin
-            for s in range(samples):
-                path[s] = own[s] + paths[k, s]
+            b, first = members[o], begin
+            write_path(shift[j], turn[j], reaches[b], own)
+            _add(own, paths[k], path)
             while first < samples:
-                bound = segment_distance(one, around[k], first) - radii[b] - link_radii[k]
+                apart = segment_distance(R[j], p[j], ends[b], R[k], p[k], link_ends[k], first)
+                bound = apart - radii[b] - link_radii[k]
                 if bound < horizon:
                     break
                 first = next_beyond(path, first, samples, bound - horizon)
             if first >= samples:
                 continue
             for m in range(firsts[k], firsts[k + 1]):
-                c = members[m]
-                other, other_path = placed(R[k], p[k], ends[c]), path_of(shift[k], turn[k], reaches[c])
-                for s in range(samples):
-                    path[s] = own[s] + other_path[s]
-                s = first
+                c, s = members[m], first
+                write_path(shift[k], turn[k], reaches[c], path)
+                _add(own, path, path)
                 while s < samples:
-                    bound = segment_distance(one, other, s) - radii[b] - radii[c]
+                    apart = segment_distance(R[j], p[j], ends[b], R[k], p[k], ends[c], s)
+                    bound = apart - radii[b] - radii[c]
                     if bound < horizon:
                         at[e], bounds[e] = s, bound
                         e += 1
@@ -268,31 +263,32 @@ def _near_each_other(
 
 
 @njit(cache=True, error_model="numpy")
-def tighten(samples, bounds, shift_one, turn_one, reach_one, shift_other, turn_other, reach_other, at, distance):
+def _add(one, other, path):
+    for s in range(path.size):
+        path[s] = one[s] + other[s]
+
+
+@njit(cache=True, error_model="numpy")
+def tighten(samples, bounds, path_one, path_other, at, distance):
     """Enter an exact distance into the bounds of one pair, as its neighbours see it; `at` itself is done (inf).
 
     Args:
         samples: (E,) of the pair.
         bounds: (E,) changed in place.
-        shift_one: (S,) path of the link of one body (m), of `Motion`.
-        turn_one: (S,) its turns.
-        reach_one: How far that body extends from the middle of its link (m).
-        shift_other: Of the other one.
-        turn_other: Of the other one.
-        reach_other: Of the other one.
+        path_one: (S,) of one body (m).
+        path_other: (S,) of the other one.
         at: Which of the samples was measured.
         distance: What was measured (m).
 
     Returns:
         Which bound is now the least.
     """
-    path, other = path_of(shift_one, turn_one, reach_one), path_of(shift_other, turn_other, reach_other)
-    here, least = path[samples[at]] + other[samples[at]], 0
+    here, least = path_one[samples[at]] + path_other[samples[at]], 0
     bounds[at] = np.inf
     for e in range(samples.size):
         if e != at:
             s = samples[e]
-            bounds[e] = max(bounds[e], distance - abs(path[s] + other[s] - here))
+            bounds[e] = max(bounds[e], distance - abs(path_one[s] + path_other[s] - here))
         if bounds[e] < bounds[least]:
             least = e
     return least
@@ -307,6 +303,16 @@ def lowest(stops, bounds):
             if bounds[e] < bounds[least[k]]:
                 least[k] = e
     return least
+
+
+@njit(cache=True)
+def nearest_pair(least, bounds):
+    """Which of the pairs has the lowest bound of all, and that bound (m), for the answer of `lowest`."""
+    pair = 0
+    for k in range(least.size):
+        if bounds[least[k]] < bounds[least[pair]]:
+            pair = k
+    return pair, bounds[least[pair]]
 
 
 @njit(cache=True)

@@ -34,14 +34,14 @@ class Motion:
     shift: Array
     turn: Array
 
-
-def follow(R: Array, p: Array, middles: Array) -> Motion:
-    """Motion of links (F, 3, 3, S), (F, 3, S) whose middles (F, 3) are given in their frames."""
-    return Motion(R, p, *_follow(R, p, middles))
+    def path(self, link: int, reach: float) -> Array:
+        """(S,) path of a body that extends by `reach` (m) from the middle of its link, at most (m)."""
+        return self.shift[link] + reach * self.turn[link]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _follow(R, p, middles):
+def follow(R, p, middles):
+    """The arrays of `Motion` for poses of links (F, 3, 3, S), (F, 3, S) and the middles of their bodies (F, 3)."""
     links, samples = p.shape[0], p.shape[2]
     shift, turn = np.zeros((links, samples)), np.zeros((links, samples))
     row = np.empty(samples)
@@ -62,7 +62,7 @@ def _follow(R, p, middles):
             path += shift[k, s]
             angle += turn[k, s]
             shift[k, s], turn[k, s] = path, angle
-    return shift, turn
+    return R, p, shift, turn
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
@@ -93,12 +93,19 @@ def seen_from(R_view, p_view, R, p):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def path_of(shift, turn, reach):
-    """(S,) path (m) that a body which extends by `reach` (m) from the middle of its link has covered, at most."""
-    path = np.empty(shift.size)
+def write_path(shift, turn, reach, path):
+    """Write (S,) how far (m) a body which extends by `reach` (m) from the middle of its link has moved, at most."""
     for s in range(path.size):
         path[s] = shift[s] + reach * turn[s]
-    return path
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def paths_of(shift, turn, reaches):
+    """(F, S) paths (m) of links that extend by `reaches` (F,) from their middles (m)."""
+    paths = np.empty((reaches.size, shift.shape[1]))
+    for k in range(reaches.size):
+        write_path(shift[k], turn[k], reaches[k], paths[k])
+    return paths
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -116,18 +123,6 @@ def next_beyond(path, s, stop, room):
         else:
             high = middle
     return low
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def placed(R, p, ends):
-    """Points (2, 3) that a link carries, at every sample: (2, 3, S)."""
-    out = np.empty((2, 3, p.shape[1]))
-    for e in range(2):
-        x, y, z = ends[e, 0], ends[e, 1], ends[e, 2]
-        for a in range(3):
-            for s in range(out.shape[2]):
-                out[e, a, s] = p[a, s] + R[a, 0, s] * x + R[a, 1, s] * y + R[a, 2, s] * z
-    return out
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})

@@ -13,14 +13,14 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 
-from dyngrasp.models.batch_dynamics import compose, cosine_sine, link_poses
+from dyngrasp.models.batch_dynamics import compose, link_poses, side_by_side
 from dyngrasp.planning.clearance import clearance_entries
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.part_motion import PartMotion, part_motion
 from dyngrasp.planning.plan_samples import at_grid_points, between, waypoints_of
 from dyngrasp.planning.problem import AuditEntry, AuditReport
-from dyngrasp.planning.worst_values import ROWS, PlanModels, hand_in_grasp_frame, plan_models, side_by_side
+from dyngrasp.planning.worst_values import ROWS, PlanModels, hand_in_grasp_frame, plan_models
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, largest_defect, largest_difference
 
@@ -175,7 +175,7 @@ def _violations(arm, gripper):
     defects, jumps = np.zeros(3), np.zeros((2, 2))
     for phases in (arm, gripper):
         for i in range(3):
-            defects[i] = _larger(largest_defect(*phases[i]), defects[i])
+            defects[i] = _larger(largest_defect(phases[i]), defects[i])
         for i in range(2):
             (_, q, w, _), (_, q_next, w_next, _) = phases[i], phases[i + 1]
             jumps[0, i] = _larger(largest_difference(q[-1], q_next[0]), jumps[0, i])
@@ -222,12 +222,12 @@ def _boundary_errors(arm, gripper, ends, q_place, q_h_place, hand, part, grasp_o
     q[:, 3], q_h[:, 3] = q_place, q_h_place
     both = side_by_side(q, q_h, arm_indices, hand_indices)
     R, p = np.empty((both.shape[0], 3, 3, 4)), np.empty((both.shape[0], 3, 4))
-    link_poses(*cosine_sine(both), *tree, R, p)
+    link_poses(both, tree, R, p)
     hand_R, hand_p = np.empty((3, 3, 3, 4)), np.empty((3, 3, 4))
     for f in range(3):
         compose(R[links[f]], p[links[f]], turns[f], shifts[f], hand_R[f], hand_p[f])
     times = np.array([ends[0], ends[1], ends[2]])
-    offset, angle = hand_in_grasp_frame(hand_R, hand_p, *part, *grasp_on_part, times)
+    offset, angle = hand_in_grasp_frame(hand_R, hand_p, part, grasp_on_part, times)
     offset[2, 0] -= above
     if moving:
         # A part that is not taken when it was to be rides on.

@@ -12,9 +12,10 @@ import trimesh
 from numba import njit
 
 from dyngrasp.models.assembly import Assembly, assemble
-from dyngrasp.models.batch_dynamics import BatchModel, compose
+from dyngrasp.models.batch_dynamics import BatchModel, compose, link_poses, side_by_side
 from dyngrasp.models.bounding_volumes import bounding_bodies, boxes_around
 from dyngrasp.models.grasp_object import Grasp
+from dyngrasp.models.link_motion import Motion, follow, seen_from
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.part_motion import PartMotion, part_poses
 from dyngrasp.planning.plan_samples import Waypoints
@@ -55,6 +56,7 @@ class CellGeometry:
         self.assembly: Assembly = assemble(task.robot, task.gripper)
         model, geometry = self.assembly.pin_model, self.assembly.geometry
         self._tree = BatchModel.from_pinocchio(model)
+        self._indices = self.assembly.arm_indices, self.assembly.hand_indices
         bodies = list(geometry.geometryObjects)
         # The model of the whole lives as long as its bodies, which refer to it.
         self._geometry = geometry
@@ -103,17 +105,21 @@ class CellGeometry:
         hanging = self._turned(int(flange.parentJoint), pin.SE3(flange.placement) * self.T_flange_part)
         self._hanging = int(flange.parentJoint), read_only(hanging.rotation), read_only(hanging.translation)
 
-    def poses(self, waypoints: Waypoints, part: PartMotion) -> tuple[Array, Array]:
-        """Poses of all links in the world: (F, 3, 3, S), (F, 3, S); `part` says where that is until it is lifted."""
-        both = np.empty((self._tree.parents.size, waypoints.times.size))
-        both[self.assembly.arm_indices], both[self.assembly.hand_indices] = waypoints.q, waypoints.q_h
-        R, p = np.empty((len(both) + 2, 3, 3, both.shape[1])), np.empty((len(both) + 2, 3, both.shape[1]))
-        self._tree.link_poses(both, R[1:-1], p[1:-1])
-        _add_world_and_part(R, p, *self._hanging, waypoints.times[: waypoints.lifted], *part)
-        return R, p
+    def motions(self, waypoints: Waypoints, part: PartMotion) -> tuple[Motion, Motion, bool]:
+        """How all links move, seen from the world and from the part, and whether all of that is finite.
+
+        Args:
+            waypoints: Samples of a plan.
+            part: Where the part is until it is lifted.
+        """
+        world, seen, finite = _motions(
+            waypoints.q, waypoints.q_h, waypoints.times, waypoints.lifted, self._indices, self._tree.tree,
+            self._hanging, self.middles, part,
+        )  # fmt: skip
+        return Motion(*world), Motion(*seen), finite
 
     def distance(self, i: int, j: int, R: Array, p: Array, k: int) -> float:
-        """Exact distance of two bodies at sample k of `poses` (m)."""
+        """Exact distance of two bodies (m) at sample k of links (F, 3, 3, S), (F, 3, S) in the world."""
         self.result.clear()
         return coal.distance(
             self.shapes[i], self._at(i, R, p, k), self.shapes[j], self._at(j, R, p, k), self.request, self.result
@@ -145,10 +151,21 @@ def _convex(path: Path) -> tuple[coal.Convex, Array]:
 
 
 @njit(cache=True, error_model="numpy")
-def _add_world_and_part(R, p, carrier, turn, shift, times, rotation, position, twist, arrival):
-    """The first and the last link: the world; the part, standing at the first samples, then fixed to a link."""
+def _motions(q, q_h, times, lifted, indices, tree, hanging, middles, part):
+    """Both motions as arrays, and whether they are finite."""
+    arm_indices, hand_indices = indices
+    both = side_by_side(q, q_h, arm_indices, hand_indices)
+    R, p = np.empty((middles.shape[0], 3, 3, times.size)), np.empty((middles.shape[0], 3, times.size))
     R[WORLD], p[WORLD] = 0.0, 0.0
     for a in range(3):
         R[WORLD, a, a] = 1.0
+    link_poses(both, tree, R[1:-1], p[1:-1])
+    # The part stands at the first samples, then it is fixed to a link.
+    carrier, turn, shift = hanging
     compose(R[carrier], p[carrier], turn, shift, R[-1], p[-1])
-    part_poses(rotation, position, twist, arrival, times, R[-1], p[-1])
+    part_poses(part, times[:lifted], R[-1], p[-1])
+    seen_R, seen_p = seen_from(R[-1], p[-1], R, p)
+    world, seen = follow(R, p, middles), follow(seen_R, seen_p, middles)
+    # Comparisons would lose a NaN on the way to the least distance; the paths are sums over all of them.
+    covered = world[2][:, -1].sum() + world[3][:, -1].sum()
+    return world, seen, np.isfinite(covered + times.sum() + p[:, :, 0].sum())

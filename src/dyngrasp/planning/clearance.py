@@ -8,6 +8,7 @@ what it shows bounds the samples around it; it ends when no bound is below the l
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from dyngrasp.models.distance_bounds import (
     Candidates,
@@ -15,10 +16,11 @@ from dyngrasp.models.distance_bounds import (
     near_each_other,
     near_ground,
     near_pieces,
+    nearest_pair,
     pieces_near_ground,
     tighten,
 )
-from dyngrasp.models.link_motion import Motion, follow, seen_from
+from dyngrasp.models.link_motion import Motion
 from dyngrasp.planning.cell_geometry import WORLD, CellGeometry, cell_geometry
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.grasp_task import GraspTask
@@ -49,12 +51,9 @@ def clearance_entries(task: GraspTask, targets: GraspTargets, waypoints: Waypoin
         Entries "ground_clearance", "part_clearance", "self_clearance" and, for the carried part against ground and
         arm, "carried_clearance"; distances above `HORIZON` are reported as `HORIZON`.
     """
-    cell = cell_geometry(task, targets.grasp.name)
-    times = waypoints.times
-    R, p = cell.poses(waypoints, part_motion(targets))
-    world, seen = follow(R, p, cell.middles), follow(*seen_from(R[-1], p[-1], R, p), cell.middles)
-    # Comparisons would lose a NaN on the way to the least distance; the paths are sums over all of them.
-    if np.isfinite(times.sum() + world.shift[:, -1].sum() + world.turn[:, -1].sum() + p[..., 0].sum()):
+    cell, times = cell_geometry(task, targets.grasp.name), waypoints.times
+    world, seen, finite = cell.motions(waypoints, part_motion(targets))
+    if finite:
         found = _checked(cell, waypoints, world, seen)
     else:
         found = [(np.nan, 0, "a motion that is not finite")] * len(_CHECKS)
@@ -83,24 +82,35 @@ def _checked(cell: CellGeometry, waypoints: Waypoints, world: Motion, seen: Moti
 
     `HORIZON`, the first sample and nobody if nothing comes nearer than that.
     """
-    bodies, pieces, samples, lifted = cell.bodies, cell.pieces, waypoints.times.size, waypoints.lifted
-    # What does not move is where it is meant to be; the pads count until they close.
-    starts = np.where(bodies.links > WORLD, 0, samples)
-    stops = np.where(cell.is_pad, waypoints.closing, samples)
-    from_lift, to_end = np.where(cell.on_arm, lifted, samples), np.full_like(stops, samples)
+    bodies, pieces, lifted = cell.bodies, cell.pieces, waypoints.lifted
+    windows = _windows(bodies.links, cell.is_pad, cell.on_arm, waypoints.closing, lifted, waypoints.times.size)
     nobody = HORIZON, 0, ""
     # When the part is taken the hand is nearer to it than on the way: what is farther then need not be looked at.
-    closed = max(lifted - 1, 0)
-    at_once = np.maximum(starts, closed), np.minimum(stops, closed + 1)
-    closest = _nearest(cell, near_pieces(seen, bodies, pieces, *at_once, HORIZON), seen, world, nobody)
+    closest = _nearest(cell, near_pieces(seen, bodies, pieces, windows[0], HORIZON), seen, world, nobody)
     carried = _nearest(cell, pieces_near_ground(world, pieces, lifted, HORIZON), world, world, (HORIZON, lifted, ""))
     return [
         _nearest(cell, near_ground(world, bodies, HORIZON), world, world, nobody),
-        _nearest(cell, near_pieces(seen, bodies, pieces, starts, stops, closest[0]), seen, world, closest),
+        _nearest(cell, near_pieces(seen, bodies, pieces, windows[1], closest[0]), seen, world, closest),
         _nearest(cell, near_each_other(world, bodies, cell.link_pairs, HORIZON), world, world, nobody),
         # The part hangs in the gripper only from the lift on.
-        _nearest(cell, near_pieces(seen, bodies, pieces, from_lift, to_end, carried[0]), seen, world, carried),
+        _nearest(cell, near_pieces(seen, bodies, pieces, windows[2], carried[0]), seen, world, carried),
     ]
+
+
+@njit(cache=True)
+def _windows(links, is_pad, on_arm, closing, lifted, samples):
+    """(3, B, 2) first sample at which each body counts against the part, and one after the last.
+
+    When the part is taken; all the time until then and after it; the arm's, for a part that hangs.
+    """
+    windows, taken = np.empty((3, links.size, 2), np.int64), max(lifted - 1, 0)
+    for b in range(links.size):
+        # What does not move is where it is meant to be; the pads count until they close.
+        first, last = 0 if links[b] != WORLD else samples, closing if is_pad[b] else samples
+        windows[0, b] = max(first, taken), min(last, taken + 1)
+        windows[1, b] = first, last
+        windows[2, b] = lifted if on_arm[b] else samples, samples
+    return windows
 
 
 def _nearest(cell: CellGeometry, found: Candidates, motion: Motion, world: Motion, best: Nearest) -> Nearest:
@@ -108,10 +118,9 @@ def _nearest(cell: CellGeometry, found: Candidates, motion: Motion, world: Motio
     if not len(found.pairs):
         return best
     least = lowest(found.stops, found.bounds)
-    bounds = found.bounds[least]
     while True:
-        pair = int(bounds.argmin())
-        if bounds[pair] >= best[0] - RESOLUTION:
+        pair, bound = nearest_pair(least, found.bounds)
+        if bound >= best[0] - RESOLUTION:
             return best
         i, j = found.pairs[pair].tolist()
         k = int(found.samples[least[pair]])
@@ -119,12 +128,9 @@ def _nearest(cell: CellGeometry, found: Candidates, motion: Motion, world: Motio
         if not distance >= best[0]:
             best = distance, k, f"{cell.names[i]} and {cell.names[j]}"
         own = slice(found.stops[pair], found.stops[pair + 1])
-        one, other = cell.links[i], cell.links[j]
-        least[pair] = own.start + tighten(
-            found.samples[own], found.bounds[own], motion.shift[one], motion.turn[one], cell.reaches[i],
-            motion.shift[other], motion.turn[other], cell.reaches[j], least[pair] - own.start, distance,
-        )  # fmt: skip
-        bounds[pair] = found.bounds[least[pair]]
+        one, other = (motion.path(cell.links[body], cell.reaches[body]) for body in (i, j))
+        at = least[pair] - own.start
+        least[pair] = own.start + tighten(found.samples[own], found.bounds[own], one, other, at, distance)
 
 
 def _sunk(task: GraspTask, targets: GraspTargets) -> float:

@@ -12,24 +12,28 @@ PartMotion = tuple[Array, Array, Array, float]
 
 
 def part_motion(targets: GraspTargets) -> PartMotion:
-    """First arguments of `part_poses`, for the part that is to be grasped; `GraspTargets` says the same of one time."""
+    """First argument of `part_poses`, for the part that is to be grasped; `GraspTargets` says the same of one time.
+
+    Returns:
+        Rotation (3, 3) and position (3,) (m) at and after the time of arrival, in the world; velocity of the origin
+        (m/s) and angular velocity (rad/s) before, (6,) in world axes; the time of arrival (s), which a part at rest has
+        none of.
+    """
     T = targets.T_world_object
     return np.ascontiguousarray(T.rotation), np.array(T.translation), targets.twist_world, float(targets.grasp_time)
 
 
 @njit(cache=True, error_model="numpy")
-def part_poses(rotation, position, twist, arrival, times, R, p):
+def part_poses(motion, times, R, p):
     """Poses at some times of a part that keeps its velocities until it is taken.
 
     Args:
-        rotation: (3, 3) at and after `arrival`, in the world.
-        position: (3,) then (m).
-        twist: (6,) velocity of its origin (m/s) and angular velocity (rad/s) before, world axes.
-        arrival: s. A part at rest has none.
+        motion: Of `part_motion`.
         times: (M,) s.
         R: (3, 3, ≥ M) in which the rotations are written,
         p: (3, ≥ M) and the positions (m).
     """
+    rotation, position, twist, arrival = motion
     x, y, z = twist[3], twist[4], twist[5]
     rate = np.sqrt(x * x + y * y + z * z)
     if rate > 0.0:

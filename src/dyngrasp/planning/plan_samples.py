@@ -104,8 +104,7 @@ def _inside(arm, gripper, ends, times, grid_stops, suspects):
 
 @njit(cache=True, error_model="numpy")
 def _along_paths(arm, gripper, ends, since):
-    count, local = 0, np.empty(0)
-    stops = np.zeros(3, np.int64)
+    local, stops = np.empty(0), np.zeros(3, np.int64)
     for i in range(3):
         if since < ends[i]:
             steps = _steps(arm[i], gripper[i], max(since - (ends[i] - arm[i][0]), 0.0))
@@ -126,7 +125,7 @@ def _states(arm, gripper, ends, local, stops):
         for k in range(start, stop):
             times[k] = ends[i] - arm[i][0] + local[k]
         for trajectory, out in ((arm[i], both[0]), (gripper[i], both[1])):
-            interpolate(*trajectory, local[start:stop], out[:, :, start:stop].transpose(0, 2, 1))
+            interpolate(trajectory, local[start:stop], out[:, :, start:stop].transpose(0, 2, 1))
         start = stop
     return times, both[0], both[1], (stops[0], stops[1], stops[2])
 
@@ -148,7 +147,7 @@ def _steps(arm, gripper, start):
             _add_steps(trajectory[1], path)
         else:
             states = np.empty((3, grid.size, trajectory[1].shape[1]))
-            interpolate(*trajectory, grid, states)
+            interpolate(trajectory, grid, states)
             _add_steps(states[0], path)
     path = np.cumsum(path)
     if not path[last] < np.inf:

@@ -14,10 +14,10 @@ from dyngrasp.models.batch_dynamics import (
     Attachments,
     BatchModel,
     compose,
-    cosine_sine,
     frame_poses,
     newton,
     newton_euler,
+    side_by_side,
 )
 from dyngrasp.models.kinematic_tree import frames_named
 from dyngrasp.models.pinch import Pinch, pad_loads
@@ -71,9 +71,8 @@ class PlanModels:
         self._empty, self._loaded = BatchModel.from_pinocchio(task.robot_empty.loaded_model).chain, loaded.chain
         assembly = assemble(robot, gripper)
         tree = BatchModel.from_pinocchio(assembly.pin_model)
-        self.hand = (
-            assembly.arm_indices, assembly.hand_indices, tree.tree, self._frames(tree, assembly.pin_model, assembly.flange_id, task).arrays
-        )
+        frames = self._frames(tree, assembly.pin_model, assembly.flange_id, task)
+        self.hand = assembly.arm_indices, assembly.hand_indices, tree.tree, frames.arrays
         self.grasp_on_part = read_only(grasp.T_object_grasp.rotation), read_only(grasp.T_object_grasp.translation)
         held = loaded.attach([(robot.n, robot.T_last_flange * task.T_flange_closed(grasp))])
         T_link_held = pin.SE3(held.rotations[0], held.positions[0])
@@ -139,19 +138,19 @@ def _worst_values(
     closing, lifted, last = stops
     table, suspects = np.full((len(ROWS), 3), -1.0), np.zeros(last, dtype=np.bool_)
     torque = np.empty((arm.shape[1], last))
-    _limits(arm, *limits[0], times, table[:GRIPPER], suspects)
-    _limits(gripper, *limits[1], times, table[GRIPPER:TORQUE], suspects)
+    _limits(arm, limits[0], times, table[:GRIPPER], suspects)
+    _limits(gripper, limits[1], times, table[GRIPPER:TORQUE], suspects)
     if lifted:
         q, w, v = arm[0, :, :lifted].copy(), arm[1, :, :lifted].copy(), arm[2, :, :lifted].copy()
-        torque[:, :lifted] = newton_euler(*cosine_sine(q), w, v, *empty)[0]
+        torque[:, :lifted] = newton_euler(q, w, v, empty)[0]
         arm_indices, hand_indices, tree, frames = hand
         both = side_by_side(q, gripper[0, :, :lifted], arm_indices, hand_indices)
-        R, p = frame_poses(*cosine_sine(both), *tree, *frames)
+        R, p = frame_poses(both, tree, frames)
         _grasp_frame(R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects)
     if last > lifted:
         q, w, v = arm[0, :, lifted:].copy(), arm[1, :, lifted:].copy(), arm[2, :, lifted:].copy()
-        torque[:, lifted:], motion = newton_euler(*cosine_sine(q), w, v, *loaded)
-        _hold(motion, *held, times, lifted, table[HOLD], suspects)
+        torque[:, lifted:], motion = newton_euler(q, w, v, loaded)
+        _hold(motion, held, times, lifted, table[HOLD], suspects)
     share = _shares(torque, np.zeros(limits[2].size), limits[2])
     _judge(share, 0, 1.0, 1.0, times, table[TORQUE], suspects)
     # What follows the last sample of a phase is a join: no time passes there.
@@ -161,20 +160,10 @@ def _worst_values(
     return table, suspects
 
 
-@njit(cache=True)
-def side_by_side(q, q_h, arm_indices, hand_indices):
-    """Configurations (n + m, M) of the tree for arm (n, M) and gripper (m, M) positions."""
-    both = np.empty((arm_indices.size + hand_indices.size, q.shape[1]))
-    for i in range(arm_indices.size):
-        both[arm_indices[i]] = q[i]
-    for i in range(hand_indices.size):
-        both[hand_indices[i]] = q_h[i]
-    return both
-
-
 @njit(cache=True, error_model="numpy")
-def _limits(states, middles, limits, times, table, suspects):
-    """Positions, velocities and accelerations (3, n, M), less their middles (3, n), as parts of their limits (3, n)."""
+def _limits(states, boxes, times, table, suspects):
+    """Positions, velocities and accelerations (3, n, M) within `_boxes`, as parts of their half-widths."""
+    middles, limits = boxes
     for kind in range(3):
         share = _shares(states[kind], middles[kind], limits[kind])
         if kind < 2:
@@ -196,16 +185,14 @@ def _shares(values, middles, limits):
 
 
 @njit(cache=True, error_model="numpy")
-def _grasp_frame(
-    R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects
-):
+def _grasp_frame(R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects):
     """What the hand (3, 3, 3, M), (3, 3, M) does above and at the grasp frame, in approach and grasp.
 
     In the approach h(q) of eq. (6), how high G is above the inverted Gaussian of eq. (5) times `wall`. In the grasp G
     stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes.
     """
     samples, (sigma_x, sigma_y, threshold) = p.shape[2], funnel
-    G, angle = hand_in_grasp_frame(R, p, *part, *grasp_on_part, times[:samples])
+    G, angle = hand_in_grasp_frame(R, p, part, grasp_on_part, times[:samples])
     height, above = np.empty((1, closing)), np.empty((1, samples - closing))
     aside, tilt = np.empty(above.shape), np.empty(above.shape)
     for s in range(closing):
@@ -223,18 +210,14 @@ def _grasp_frame(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def hand_in_grasp_frame(R, p, rotation, position, twist, arrival, R_part_grasp, p_part_grasp, times):
+def hand_in_grasp_frame(R, p, part, grasp_on_part, times):
     """The hand as seen from the grasp frame where the part is at times (M,).
 
     Args:
         R: (3, 3, 3, ≥ M) frames of the hand and both pads.
         p: (3, 3, ≥ M) m.
-        rotation: Of the part, with the next three as for `part_poses`.
-        position: Of the part.
-        twist: Of the part.
-        arrival: Of the part.
-        R_part_grasp: (3, 3) grasp frame in the part's.
-        p_part_grasp: (3,) m.
+        part: Of `part_motion`.
+        grasp_on_part: Rotation (3, 3) and position (3,) (m) of the grasp frame in the part's.
         times: (M,) s.
 
     Returns:
@@ -244,8 +227,8 @@ def hand_in_grasp_frame(R, p, rotation, position, twist, arrival, R_part_grasp, 
     samples = times.size
     R_part, p_part = np.empty((3, 3, samples)), np.empty((3, samples))
     R_grasp, p_grasp = np.empty((3, 3, samples)), np.empty((3, samples))
-    part_poses(rotation, position, twist, arrival, times, R_part, p_part)
-    compose(R_part, p_part, R_part_grasp, p_part_grasp, R_grasp, p_grasp)
+    part_poses(part, times, R_part, p_part)
+    compose(R_part, p_part, grasp_on_part[0], grasp_on_part[1], R_grasp, p_grasp)
     G, angle = np.empty((3, samples)), np.empty(samples)
     for s in range(samples):
         x = (p[1, 0, s] + p[2, 0, s]) / 2 - p_grasp[0, s]
@@ -261,13 +244,13 @@ def hand_in_grasp_frame(R, p, rotation, position, twist, arrival, R_part_grasp, 
 
 
 @njit(cache=True, error_model="numpy")
-def _hold(motion, mass, first_moment, inertia, R, p, pinch, times, first, row, suspects):
+def _hold(motion, held, times, first, row, suspects):
     """Share of its friction that the busier pad needs to carry the part, velocity terms included.
 
     The safety factor of the planner is not applied here: at 1 the part would just slip. The part is given in the frame
-    of the last link, like its `motion` (9, M), and so is the grasp frame R, p.
+    of the last link, like its `motion` (9, M), and so is the grasp frame.
     """
-    samples = motion.shape[1]
+    (mass, first_moment, inertia, R, p, pinch), samples = held, motion.shape[1]
     wrench, share = np.empty((6, samples)), np.empty((1, samples))
     newton(mass, first_moment, inertia, motion, wrench)
     for s in range(samples):
