@@ -27,6 +27,8 @@ from dyngrasp.trajectory import Trajectory
 
 _KNOTS = 4
 
+_AT_REST = read_only(np.tile(np.eye(3, 4), (_KNOTS - 1, 1, 1)))
+
 
 @dataclass(frozen=True)
 class DescentSettings:
@@ -65,40 +67,77 @@ def carried_descent(
     Returns:
         Reference and weights (N+1,) in units of Q_v (1/s⁴); None if the arm cannot follow the carried motion.
     """
-    updater = target_updater(task)
-    q_pregrasp = targets.pregrasp.position
-    chain, T_flange_grasp = task.robot.flange_chain, updater.T_flange_grasp(targets.gripper_open)
-    N = reference.intervals
-    at_end = chain.pose(q_pregrasp) * chain.pose(reference.position[-1]).inverse()
-
-    def shift(k: int) -> pin.SE3:
-        """Where the carried motion is at a grid point, seen from the old one: parts that move were elsewhere then."""
-        if not (targets.moving or (previous is not None and previous.moving)):
-            return at_end
-        now, end = start + k / N * reference.duration, start + reference.duration
-        return _since(targets, now, end) * at_end * _since(previous, now, end).inverse()
-
+    updater, chain = target_updater(task), task.robot.flange_chain
+    N, T, position = reference.intervals, reference.duration, reference.position
+    hand = updater.T_flange_grasp(targets.gripper_open)
     begin = settings.height * task.grasp_object.funnel.z_threshold - task.settings.pregrasp_distance
-    below = _first_below(
-        chain.rotations, chain.offsets, reference.position, T_flange_grasp.translation, T_flange_grasp.rotation, begin
-    )
+    below = _first_below(chain.rotations, chain.offsets, position, hand.translation, hand.rotation, begin)
     entry = min(max(below, round(settings.earliest * N)), N - _KNOTS)
     knots = _knots(entry, N)
+    old, new = (_from_end(moves, start, T, N, knots) for moves in (previous, targets))
+    poses, postures = np.empty((_KNOTS - 1, 3, 4)), np.empty((_KNOTS, position.shape[1]))
+    postures[-1] = targets.pregrasp.position
+    _carried_poses(chain.rotations, chain.offsets, position, knots, postures[-1], old, new, poses)
     try:
-        carried = [
-            updater.posture(shift(k) * chain.pose(reference.position[k]), reference.position[k]) for k in knots[:-1]
-        ]
+        for i, k in enumerate(knots[:-1]):
+            postures[i] = updater.posture(pin.SE3(poses[i, :, :3], poses[i, :, 3]), position[k])
     except OutOfReach:
         return None
-    T, motion = reference.duration, np.empty((3, N + 1, q_pregrasp.size))
-    difference = np.array([*carried, q_pregrasp])
-    for row, k in zip(difference, knots, strict=True):
-        row -= reference.position[k]
-    old = (reference.position, reference.velocity, reference.acceleration)
-    _bend(old, entry, T, _lagrange(entry, N), difference, motion)
-    weights = np.zeros(N + 1)
+    motion, weights = np.empty((3, *position.shape)), np.zeros(N + 1)
+    bent = (position, reference.velocity, reference.acceleration)
+    _bend(bent, entry, T, _lagrange(entry, N), knots, postures, motion)
     weights[entry:] = (settings.stiffness / ((1 - entry / N) * T)) ** 4
     return Trajectory(T, *frozen(motion)), weights
+
+
+def _from_end(targets: GraspTargets | None, start: float, duration: float, N: int, knots: tuple[int, ...]) -> Array:
+    """(K−1, 3, 4) motion [R | p] of a part that takes its pose at the end to that at each knot but the last."""
+    if targets is None or not targets.moving:
+        return _AT_REST
+    back = targets.T_world_object_at(start + duration).inverse()
+    times = (start + k / N * duration for k in knots[:-1])
+    return np.array([(targets.T_world_object_at(t) * back).homogeneous[:3] for t in times])
+
+
+@njit(cache=True, error_model="numpy")
+def _carried_poses(rotations, offsets, position, knots, q_end, old, new, poses):
+    """Write the poses (K−1, 3, 4) of the flange at the knots of positions (N+1, n), carried along with the part.
+
+    What takes the old end to the new one, at `q_end` (n,), takes the old motion to the new one as seen from the part.
+    Parts that move were elsewhere then, as `_from_end` tells of the old and the new one.
+    """
+    frames = np.empty((q_end.size + 1, 3, 4))
+    place_frames(rotations, offsets, position[-1], frames)
+    old_end = frames[-1].copy()
+    place_frames(rotations, offsets, q_end, frames)
+    new_end = frames[-1].copy()
+    seen = np.empty((3, 4))
+    for i in range(poses.shape[0]):
+        place_frames(rotations, offsets, position[knots[i]], frames)
+        _before(old[i], frames[-1], seen)
+        _before(old_end, seen, frames[0])
+        _after(new_end, frames[0], seen)
+        _after(new[i], seen, poses[i])
+
+
+@njit(cache=True, error_model="numpy")
+def _after(first, then, out):
+    """Write the product of two poses (3, 4)."""
+    for a in range(3):
+        for b in range(4):
+            out[a, b] = first[a, 3] if b == 3 else 0.0
+            for c in range(3):
+                out[a, b] += first[a, c] * then[c, b]
+
+
+@njit(cache=True, error_model="numpy")
+def _before(first, then, out):
+    """Write the product of the inverse of a pose (3, 4) and another one."""
+    for a in range(3):
+        for b in range(4):
+            out[a, b] = 0.0
+            for c in range(3):
+                out[a, b] += first[c, a] * (then[c, b] - (first[c, 3] if b == 3 else 0.0))
 
 
 @njit(cache=True, error_model="numpy")
@@ -139,9 +178,11 @@ def _height(flange, p_flange_grasp, axis):
 
 
 @njit(cache=True, error_model="numpy")
-def _bend(old, entry, T, polynomials, difference, motion):
-    """Write a motion (3, N+1, n): the old one, from `entry` on with polynomials of the given values at the knots."""
-    factor = 1.0
+def _bend(old, entry, T, polynomials, knots, postures, motion):
+    """Write a motion (3, N+1, n): from `entry` on polynomials bend the old one to the postures (K, n) at the knots."""
+    factor, difference = 1.0, postures.copy()
+    for i in range(len(knots)):
+        difference[i] -= old[0][knots[i]]
     for kind in range(3):
         motion[kind] = old[kind]
         for k in range(polynomials[kind].shape[0]):
@@ -150,13 +191,6 @@ def _bend(old, entry, T, polynomials, difference, motion):
                 for j in range(difference.shape[1]):
                     motion[kind, entry + k, j] += weight * difference[i, j]
         factor /= T
-
-
-def _since(targets: GraspTargets | None, now: float, end: float) -> pin.SE3:
-    """The motion of a part that takes its pose at `end` (s) to that at `now` (s)."""
-    if targets is None or not targets.moving:
-        return pin.SE3.Identity()
-    return targets.T_world_object_at(now) * targets.T_world_object_at(end).inverse()
 
 
 def _knots(entry: int, N: int) -> tuple[int, ...]:

@@ -19,7 +19,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
+from dyngrasp.models.flange_chain import place_frames
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.planning.replanning.target_update import target_updater
@@ -84,9 +86,15 @@ def funnel_recovery(
         shares: σ_0 and σ_1.
         reaction: τ (s).
     """
-    factor, end = 1.0, float(plan.phase_ends[0])
-    for now in (state, plan.sample(min(state.arm.t + reaction, math.nextafter(end, 0.0)))):
-        height, wall = _height_and_wall(now, targets, task)
+    later = min(state.arm.t + reaction, math.nextafter(float(plan.phase_ends[0]), 0.0))
+    local = later - plan.start_time
+    (q_later, *_), (hand_later, *_) = (motion.sample_many((local,)) for motion in (plan.arm[0], plan.gripper[0]))
+    factor = 1.0
+    for t, q, hand in (
+        (state.arm.t, state.arm.position, state.gripper.position),
+        (later, q_later[0], hand_later[0]),
+    ):
+        height, wall = _height_and_wall(t, q, hand, targets, task)
         if height - wall >= _MARGIN:
             continue
         inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
@@ -104,11 +112,33 @@ def lifted(constraint: NodeConstraint, by: Array) -> NodeConstraint:
     return replace(constraint, parameters=parameters)
 
 
-def _height_and_wall(state: PlanSample, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
-    """Height of G in the grasp frame and that of the wall below or above it, eq. (5) (m)."""
-    funnel = task.grasp_object.funnel
-    T_flange_grasp = target_updater(task).T_flange_grasp(state.gripper.position)
-    G = task.robot.flange_chain.pose(state.arm.position).act(T_flange_grasp.translation)
-    x, y, z = (targets.T_world_object_at(state.arm.t) * targets.grasp.T_object_grasp).actInv(G).tolist()
+def _height_and_wall(t: float, q: Array, hand: Array, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
+    """Height of G in the grasp frame and that of the wall below or above it, eq. (5) (m), at a time and postures."""
+    funnel, chain = task.grasp_object.funnel, task.robot.flange_chain
+    T_world_grasp = targets.T_world_object_at(t) * targets.grasp.T_object_grasp
+    x, y, z = _seen_from_grasp(
+        chain.rotations,
+        chain.offsets,
+        q,
+        target_updater(task).T_flange_grasp(hand).translation,
+        T_world_grasp.rotation,
+        T_world_grasp.translation,
+    )
     bell = math.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
     return z, funnel.z_threshold * (1.0 - bell)
+
+
+@njit(cache=True, error_model="numpy")
+def _seen_from_grasp(rotations, offsets, q, p_flange_G, R_world_grasp, p_world_grasp):
+    """Coordinates of G in the grasp frame (m), the arm at q (n,)."""
+    frames = np.empty((q.size + 1, 3, 4))
+    place_frames(rotations, offsets, q, frames)
+    x, y, z = 0.0, 0.0, 0.0
+    for a in range(3):
+        lever = frames[-1, a, 3] - p_world_grasp[a]
+        for b in range(3):
+            lever += frames[-1, a, b] * p_flange_G[b]
+        x += R_world_grasp[a, 0] * lever
+        y += R_world_grasp[a, 1] * lever
+        z += R_world_grasp[a, 2] * lever
+    return x, y, z

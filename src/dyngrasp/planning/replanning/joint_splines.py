@@ -197,13 +197,12 @@ def spread_weights(kind: int, weights: Array, node_weights: Array, k_first: int,
 
     See `tracking_kernel.solve` for the weights.
     """
-    out[:] = weights[kind]
-    if kind == POSITION:
-        for k in range(out.shape[0]):
-            if node_weights[k] > 0.0:
-                out[k] += node_weights[k]
-    out[:k_first] = 0.0
-    out[k_last:] = 0.0
+    for k in range(out.shape[0]):
+        weight = 0.0
+        if k_first <= k < k_last:
+            weight = weights[kind] + (node_weights[k] if kind == POSITION else 0.0)
+        for j in range(out.shape[1]):
+            out[k, j] = weight
 
 
 @njit(cache=True, error_model="numpy")

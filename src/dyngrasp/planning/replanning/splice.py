@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import MIN_INTERVALS, Status
@@ -31,7 +32,7 @@ from dyngrasp.planning.replanning.phase_programs import (
 )
 from dyngrasp.planning.replanning.tracking_qp import TrackingSolution, solve_tracking
 from dyngrasp.signals import frozen
-from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory
+from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory, interpolate
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,27 @@ def splice_time(plan: GraspPlan, wanted: float) -> float:
 
 def rest_of(trajectory: Trajectory, start: float, intervals: int) -> Trajectory:
     """What is left of a motion after `start` (s), on a grid of its own; obeys the trapezoidal rule only nearly."""
-    rest = trajectory.duration - start
-    times = start + rest / intervals * np.arange(intervals + 1)
-    return Trajectory(rest, *trajectory.sample_many(times))
+    motion = np.empty((3, intervals + 1, trajectory.position.shape[1]))
+    _write_rest(trajectory.duration, trajectory.position, trajectory.velocity, trajectory.acceleration, start, motion)
+    return Trajectory(trajectory.duration - start, *frozen(motion))
+
+
+@njit(cache=True, error_model="numpy")
+def _write_rest(duration, position, velocity, acceleration, start, motion):
+    """Write q, q̇, q̈ (3, M+1, n) at M+1 times from `start` (s) to the end."""
+    M = motion.shape[1] - 1
+    times = start + (duration - start) / M * np.arange(M + 1)
+    interpolate(duration, position, velocity, acceleration, times, motion)
+
+
+@njit(cache=True)
+def _stands(velocity, acceleration):
+    """Whether all rates (N+1, n) are zero."""
+    for array in (velocity, acceleration):
+        for rate in array.flat:
+            if rate != 0.0:
+                return False
+    return True
 
 
 def track(
@@ -143,10 +162,10 @@ def _approach(
     local = splice - (plan.phase_ends[APPROACH] - plan.durations[APPROACH])
     N, n = plan.arm[APPROACH].intervals, task.robot.n
     reference, hand = rest_of(plan.arm[APPROACH], local, N), plan.gripper[APPROACH]
-    still = not (hand.velocity.any() or hand.acceleration.any())
+    still = _stands(hand.velocity, hand.acceleration)
     if not still:
         hand = rest_of(hand, local, N)
-        still = not (hand.velocity.any() or hand.acceleration.any())
+        still = _stands(hand.velocity, hand.acceleration)
     weights = None
     if not settings.paper_rows:
         carried = carried_descent(reference, splice, targets, previous, task, settings.descents[way])
@@ -161,8 +180,7 @@ def _approach(
         return solution, plan.arm[APPROACH], plan.gripper[APPROACH]
     both = solution.trajectory(problem)
     if still:
-        zero = frozen(np.zeros((N + 1, hand.position.shape[1])))
-        return solution, both, Trajectory(both.duration, frozen(zero + hand.position[-1]), zero, zero)
+        return solution, both, Trajectory(both.duration, hand.position, hand.velocity, hand.acceleration)
     columns = (slice(0, n), slice(n, None))
     arm, fingers = (
         Trajectory(both.duration, both.position[:, c], both.velocity[:, c], both.acceleration[:, c]) for c in columns

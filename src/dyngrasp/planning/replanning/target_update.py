@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.models.grasp_object import Grasp
-from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity
+from dyngrasp.models.inverse_kinematics import TWIST_TOLERANCE, inverse_kinematics_for, joint_velocity
 from dyngrasp.models.srs_kinematics import SrsKinematics
 from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask, moved, swivel_velocity
 from dyngrasp.signals import Array, frozen
@@ -74,8 +74,7 @@ class TargetUpdater:
         approach[:3] -= settings.approach_speed * (T_pregrasp.rotation @ self.outward(previous.gripper_open))
         lift[2] += settings.lift_speed
         try:
-            velocity_before = joint_velocity(task.robot, q_before, approach)
-            velocity = joint_velocity(task.robot, q, lift)
+            velocity_before, velocity = self._rates(q_before, approach), self._rates(q, lift)
         except InvalidProblem as error:
             raise OutOfReach("the grasp", 0.0, str(error)) from error
         velocity_before += swivel_velocity(q_before, q_before, task, like=previous.pregrasp.velocity)
@@ -92,6 +91,13 @@ class TargetUpdater:
             grasp_duration=grasp_duration,
             twist_world=twist,
         )
+
+    def _rates(self, q: Array, twist_world: Array) -> Array:
+        """Joint rates (n,) for a twist of the flange; far from singular postures there is nothing to be looked at."""
+        found = self.task.robot.flange_chain.least_rates(q, twist_world)
+        if found is not None and found[1] <= TWIST_TOLERANCE:
+            return found[0]
+        return joint_velocity(self.task.robot, q, twist_world)
 
     def T_flange_grasp(self, posture: Array) -> pin.SE3:
         """The grasp frame as the hand holds it with its fingers in a posture (m,), in the flange frame."""
