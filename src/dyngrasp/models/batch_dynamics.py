@@ -254,9 +254,16 @@ def compose(R, p, turn, shift, out_R, out_p):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def newton_euler(q, w, v, chain):
     """`BatchModel.inverse_dynamics` for its `chain`."""
-    rotations, offsets, mass, first_moment, inertia, armature, gravity = chain
+    wrenches, motion = link_wrenches(q, w, v, chain)
+    return joint_torques(q, v, wrenches, chain), motion
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def link_wrenches(q, w, v, chain):
+    """Way out of the recursion: what moves each link by itself, (n, 6, M), and the motion (9, M) of the last one."""
+    rotations, offsets, mass, first_moment, inertia, _, gravity = chain
     (n, samples), (cosine, sine) = q.shape, cosine_sine(q)
-    torque, wrench = np.empty((n, samples)), np.empty((n, 6, samples))
+    wrenches = np.empty((n, 6, samples))
     motion, moved = np.zeros((9, samples)), np.empty((9, samples))
     # Lifting the base with −g stands for gravity on every link.
     for a in range(3):
@@ -264,13 +271,21 @@ def newton_euler(q, w, v, chain):
     for i in range(n):
         _to_child(cosine[i], sine[i], rotations[i], offsets[i], w[i], v[i], motion, moved)
         motion, moved = moved, motion
-        newton(mass[i], first_moment[i], inertia[i], motion, wrench[i])
+        newton(mass[i], first_moment[i], inertia[i], motion, wrenches[i])
+    return wrenches, motion
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def joint_torques(q, v, wrenches, chain):
+    """Way back of the recursion: torques (n, M) for wrenches on the links (n, 6, M), which are overwritten by sums."""
+    rotations, offsets, _, _, _, armature, _ = chain
+    (n, samples), (cosine, sine), torque = q.shape, cosine_sine(q), np.empty(q.shape)
     for i in range(n - 1, -1, -1):
         for s in range(samples):
-            torque[i, s] = wrench[i, 5, s] + armature[i] * v[i, s]
+            torque[i, s] = wrenches[i, 5, s] + armature[i] * v[i, s]
         if i > 0:
-            _to_parent(cosine[i], sine[i], rotations[i], offsets[i], wrench[i], wrench[i - 1])
-    return torque, motion
+            _to_parent(cosine[i], sine[i], rotations[i], offsets[i], wrenches[i], wrenches[i - 1])
+    return torque
 
 
 @njit(cache=True, inline="always")

@@ -15,8 +15,9 @@ from dyngrasp.models.batch_dynamics import (
     BatchModel,
     compose,
     frame_poses,
+    joint_torques,
+    link_wrenches,
     newton,
-    newton_euler,
     side_by_side,
 )
 from dyngrasp.models.kinematic_tree import frames_named
@@ -68,7 +69,9 @@ class PlanModels:
         grasp = next(grasp for grasp in task.grasp_object.grasps if grasp.name == grasp_name)
         robot, part, settings, gripper = task.robot, task.grasp_object, task.settings, task.gripper
         loaded = BatchModel.from_pinocchio(task.robot_loaded(grasp).loaded_model)
-        self._empty, self._loaded = BatchModel.from_pinocchio(task.robot_empty.loaded_model).chain, loaded.chain
+        self._empty = BatchModel.from_pinocchio(task.robot_empty.loaded_model).chain
+        # What the hand carries changes the inertia of the last link and nothing else.
+        self._loaded = float(loaded.mass[-1]), loaded.first_moment[-1], loaded.inertia[-1]
         assembly = assemble(robot, gripper)
         tree = BatchModel.from_pinocchio(assembly.pin_model)
         frames = self._frames(tree, assembly.pin_model, assembly.flange_id, task)
@@ -134,23 +137,24 @@ def _boxes(lower: Array, upper: Array, velocity: Array, acceleration: Array) -> 
 def _worst_values(
     times, arm, gripper, stops, wall, part, grasp_on_part, limits, empty, loaded, hand, held, funnel, bounds
 ):
-    """See `PlanModels.worst_values`."""
+    """See `PlanModels.worst_values`; `loaded` is the last link from the lift on."""
     closing, lifted, last = stops
     table, suspects = np.full((len(ROWS), 3), -1.0), np.zeros(last, dtype=np.bool_)
-    torque = np.empty((arm.shape[1], last))
     _limits(arm, limits[0], times, table[:GRIPPER], suspects)
     _limits(gripper, limits[1], times, table[GRIPPER:TORQUE], suspects)
     if lifted:
-        q, w, v = arm[0, :, :lifted].copy(), arm[1, :, :lifted].copy(), arm[2, :, :lifted].copy()
-        torque[:, :lifted] = newton_euler(q, w, v, empty)[0]
         arm_indices, hand_indices, tree, frames = hand
-        both = side_by_side(q, gripper[0, :, :lifted], arm_indices, hand_indices)
+        both = side_by_side(arm[0, :, :lifted], gripper[0, :, :lifted], arm_indices, hand_indices)
         R, p = frame_poses(both, tree, frames)
         _grasp_frame(R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects)
+    wrenches, motion = link_wrenches(arm[0], arm[1], arm[2], empty)
     if last > lifted:
-        q, w, v = arm[0, :, lifted:].copy(), arm[1, :, lifted:].copy(), arm[2, :, lifted:].copy()
-        torque[:, lifted:], motion = newton_euler(q, w, v, loaded)
-        _hold(motion, held, times, lifted, table[HOLD], suspects)
+        mass, first_moment, inertia = loaded
+        carrying, wrench = motion[:, lifted:].copy(), np.empty((6, last - lifted))
+        newton(mass, first_moment, inertia, carrying, wrench)
+        wrenches[-1, :, lifted:] = wrench
+        _hold(carrying, held, times, lifted, table[HOLD], suspects)
+    torque = joint_torques(arm[0], arm[2], wrenches, empty)
     share = _shares(torque, np.zeros(limits[2].size), limits[2])
     _judge(share, 0, 1.0, 1.0, times, table[TORQUE], suspects)
     # What follows the last sample of a phase is a join: no time passes there.
@@ -281,33 +285,33 @@ def _judge(values, first, bound, sign, times, row, suspects):
 
     For `sign` 1 they must not exceed the bound, for −1 not fall below it.
     """
-    _enter(values, first, sign, times, row)
+    highest = _enter(values, first, sign, times, row)
     for j in range(values.shape[0]):
         # Most rows are far from their bounds everywhere: a NaN is not, nor is a bound that is one.
-        slack = sign * bound - _highest(values[j], sign)
+        slack = sign * bound - highest[j]
         if slack != slack or not slack >= CURVATURE_FACTOR * _largest_bend(values[j]):
             _mark_suspects(values[j], bound, sign, suspects[first : first + values.shape[1]])
 
 
 @njit(cache=True, error_model="numpy")
 def _enter(values, first, sign, times, row):
-    """The worst of values (k, m), its time and which of the k it is; the first NaN, if there is one."""
-    worst, which = -np.inf, 0
+    """The worst of values (k, m), its time and which of the k it is; the first NaN, if there is one.
+
+    Returns:
+        (k,) largest of each times `sign`; NaN if there is one.
+    """
+    worst, which, highest = -np.inf, 0, np.empty(values.shape[0])
     for j in range(values.shape[0]):
-        highest = _highest(values[j], sign)
-        if not highest <= worst and worst == worst:
-            worst, which = highest, j
+        total = _total(values[j])
+        highest[j] = _maximum(values[j], sign) if total == total else np.nan
+        if not highest[j] <= worst and worst == worst:
+            worst, which = highest[j], j
     at = 0
     for k in range(values.shape[1] - 1, -1, -1):
         if sign * values[which, k] == worst or (worst != worst and values[which, k] != values[which, k]):
             at = k
     row[0], row[1], row[2] = values[which, at], times[first + at], which
-
-
-@njit(cache=True, error_model="numpy")
-def _highest(row, sign):
-    """Largest of a row times `sign`; NaN if there is one."""
-    return _maximum(row, sign) if _total(row) == _total(row) else np.nan
+    return highest
 
 
 # Reductions become vector instructions only where their order is free and, for the maximum, no NaN is left.
