@@ -1,9 +1,11 @@
 """Options that stand for overrides: which scenario comes out of them."""
 
+import runpy
 from pathlib import Path
 
 import pytest
 
+import dyngrasp
 from dyngrasp.cli.arguments import argument_parser
 from dyngrasp.experiments.scenario import load_scenario
 from dyngrasp.models.catalogue import ASSETS
@@ -84,3 +86,11 @@ class TestPathsOfModels:
 
     def test_names_stay(self, elsewhere):
         assert load_scenario("lab/look.toml", ["camera.model=ava1000"]).camera.model == "ava1000"
+
+
+def test_the_package_runs_as_a_module(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["dyngrasp", "--version"])
+    with pytest.raises(SystemExit) as left:
+        runpy.run_module("dyngrasp", run_name="__main__")
+    assert left.value.code == 0
+    assert dyngrasp.__version__ in capsys.readouterr().out

@@ -1,5 +1,7 @@
 """Records survive the disk exactly, and nothing else is taken for one."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,18 @@ def test_names_a_missing_array(delivered, tmp_path):
         kept = {name: archive[name] for name in archive.files if name != "pad_force"}
     np.savez(path, **kept)
     with pytest.raises(InputFileError, match="pad_force"):
+        EpisodeRecord.load(path)
+
+
+def test_names_a_missing_entry_of_the_header(delivered, tmp_path):
+    path = tmp_path / "cut.npz"
+    delivered.save(path)
+    with np.load(path) as archive:
+        entries = dict(archive)
+    header = json.loads(str(entries["header"]))
+    del header["arm_joints"]
+    np.savez(path, **(entries | {"header": np.array(json.dumps(header))}))
+    with pytest.raises(InputFileError, match="arm_joints"):
         EpisodeRecord.load(path)
 
 

@@ -20,7 +20,7 @@ def film(rng, share, decay, outwards=0.0, pictures=40, step=0.05):
             repeating = kept * repeating + np.sqrt(1 - kept**2) * rng.normal(size=(4, 2))
         white = rng.normal(size=(4, 2))
         errors = 0.1 * (np.sqrt(share) * repeating + np.sqrt(1 - share) * white) + outwards * OUTWARDS
-        squares.append(SeenSquare(T, 60.0, errors, OUTWARDS))
+        squares.append(SeenSquare(T, errors, OUTWARDS))
     return squares
 
 
@@ -45,7 +45,7 @@ def test_squares_that_are_seen_too_small_and_corners_behind_something_are_told()
     squares = [film(rng, share=0.0, decay=1.0, outwards=-0.2) for _ in range(10)]
     errors = squares[0][0].errors.copy()
     errors[2, 0] += 3.0
-    squares[0][0] = SeenSquare(squares[0][0].T_camera_object, 60.0, errors, OUTWARDS)
+    squares[0][0] = SeenSquare(squares[0][0].T_camera_object, errors, OUTWARDS)
     size, *_ = describe(squares)
     assert size["outwards_px"] == pytest.approx(-0.2, abs=0.01)
     assert size["outwards_deviation_px"] == pytest.approx(0.05, rel=0.2)

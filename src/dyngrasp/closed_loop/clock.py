@@ -17,14 +17,12 @@ class Tick:
     Attributes:
         index: Counts from 0.
         t: Its time (s).
-        camera: Whether the camera takes a picture now.
         replan: Whether the replanner starts now.
         record: Whether the record takes a sample now.
     """
 
     index: int
     t: float
-    camera: bool
     replan: bool
     record: bool
 
@@ -39,7 +37,7 @@ class Clock:
     Attributes:
         period: Control period (s).
         start, end: First tick, and the time at which the ticks stop (s).
-        camera_rate, replan_rate, record_rate: In Hz, at most 1/period; 0 for never.
+        replan_rate, record_rate: In Hz, at most 1/period; 0 for never.
 
     Raises:
         InvalidProblem: A period, span or rate that makes no clock.
@@ -48,7 +46,6 @@ class Clock:
     period: float
     start: float
     end: float
-    camera_rate: float = 30.0
     replan_rate: float = 10.0
     record_rate: float = 250.0
 
@@ -57,7 +54,7 @@ class Clock:
             raise InvalidProblem(f"clock: period must be > 0, got {self.period} s")
         if not (np.isfinite(self.start) and np.isfinite(self.end) and self.end > self.start):
             raise InvalidProblem(f"clock: end must come after start, got {self.start} s and {self.end} s")
-        for name in ("camera_rate", "replan_rate", "record_rate"):
+        for name in ("replan_rate", "record_rate"):
             rate = getattr(self, name)
             # Rates and periods are rounded decimals: 1000 Hz and 0.001 s must fit.
             if not 0 <= rate * self.period <= 1 + 1e-9:
@@ -70,13 +67,7 @@ class Clock:
     def __iter__(self) -> Iterator[Tick]:
         """Ticks in order of time. Each time is computed afresh: adding periods up would drift."""
         for i in range(len(self)):
-            yield Tick(
-                i,
-                self.start + i * self.period,
-                self._due(self.camera_rate, i),
-                self._due(self.replan_rate, i),
-                self._due(self.record_rate, i),
-            )
+            yield Tick(i, self.start + i * self.period, self._due(self.replan_rate, i), self._due(self.record_rate, i))
 
     def _due(self, rate: float, i: int) -> bool:
         if rate == 0:

@@ -109,11 +109,11 @@ class EpisodeRecord:
         """Read a record that `save` wrote; nothing in the file is executed.
 
         Raises:
-            InputFileError: The file is missing, is no record, or lacks an array.
+            InputFileError: The file is missing, is no record, or lacks an array or a name.
         """
         with FORMAT.opened(path) as (header, archive):
             arrays = {name: archive[name] for name in ARRAY_NAMES}
-        return cls(tuple(header["arm_joints"]), tuple(header["gripper_joints"]), **arrays, meta=header["meta"])
+            return cls(tuple(header["arm_joints"]), tuple(header["gripper_joints"]), **arrays, meta=header["meta"])
 
 
 ARRAY_NAMES = tuple(f.name for f in fields(EpisodeRecord) if f.name not in ("arm_joints", "gripper_joints", "meta"))

@@ -28,13 +28,11 @@ class SeenSquare:
 
     Attributes:
         T_camera_object: The true view.
-        side: Mean length of its sides (pixels).
         errors: (4, 2) detected less true corners (pixels).
         outwards: (4, 2) unit vectors from its middle to the corners.
     """
 
     T_camera_object: pin.SE3
-    side: float
     errors: Array
     outwards: Array
 
@@ -71,8 +69,7 @@ def seen_squares(films: FilmSet, film: Film) -> list[list[SeenSquare]]:
             true, _ = films.camera.project(corners[marker.id] @ T.rotation.T + T.translation)
             spokes = true - true.mean(axis=0)
             outwards = spokes / np.linalg.norm(spokes, axis=1)[:, None]
-            side = float(np.linalg.norm(true - np.roll(true, 1, axis=0), axis=1).mean())
-            by_marker.setdefault(marker.id, []).append(SeenSquare(T, side, marker.corners - true, outwards))
+            by_marker.setdefault(marker.id, []).append(SeenSquare(T, marker.corners - true, outwards))
     return list(by_marker.values())
 
 
