@@ -59,9 +59,12 @@ def collect(
     a_ends: tuple[bool, bool],
     codes: Indices,
 ) -> tuple[int, float]:
-    """Write the codes of the rows closer to their bound than `margin`; return their number and the least row of all."""
+    """Write the codes of the rows closer to their bound than `margin`; return their number and the least row.
+
+    The least one is infinite where all are met and none is that close.
+    """
     _, K, n = z.shape
-    count, least = 0, np.inf
+    count, least, watched = 0, np.inf, max(margin, 0.0)
     shift = T - T_lin
     scales, highest, lowest = np.empty(n), np.empty(n), np.empty(n)
     for kind in range(3):
@@ -82,9 +85,9 @@ def collect(
                 if paper:
                     value -= rates[kind - 1, k, j] * shift
                 above, below = (highest[j] - value) * scales[j], (value - lowest[j]) * scales[j]
-                nearer = min(above, below)
-                least = min(least, nearer)
-                if nearer < margin:
+                # Behind the branch, for a minimum over all of them is one long chain of dependent steps.
+                if min(above, below) < watched:
+                    least = min(least, above, below)
                     for side, g in ((0, above), (1, below)):
                         if g < margin:
                             codes[count] = ((kind * 2 + side) * K + k) * n + j

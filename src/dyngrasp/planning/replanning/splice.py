@@ -80,7 +80,7 @@ def _write_rest(duration, position, velocity, acceleration, start, motion):
     """Write q, q̇, q̈ (3, M+1, n) at M+1 times from `start` (s) to the end."""
     M = motion.shape[1] - 1
     times = start + (duration - start) / M * np.arange(M + 1)
-    interpolate(duration, position, velocity, acceleration, times, motion)
+    interpolate((duration, position, velocity, acceleration), times, motion)
 
 
 @njit(cache=True)

@@ -291,14 +291,18 @@ def _cost(
     reference: Motion, T: float, T_ref: float, z: Array, scaled: Array, node_weights: Array, k_first: int, k_last: int
 ) -> float:
     """What the deviations of q, w, a (3, N+1, n) cost."""
-    total = 0.0
-    n = z.shape[2]
+    total, inside = 0.0, slice(k_first, k_last)
     for kind in range(3):
         factor, _ = _of_reference(kind, T, T_ref)
-        for k in range(k_first, k_last):
-            weight = scaled[kind] + (node_weights[k] if kind == POSITION else 0.0)
-            for j in range(n):
-                total += weight * (z[kind, k, j] - factor * reference[kind][k, j]) ** 2
+        reached, wanted = z[kind, inside].ravel(), reference[kind][inside].ravel()
+        squares = 0.0
+        for i in range(reached.size):
+            squares += (reached[i] - factor * wanted[i]) ** 2
+        total += scaled[kind] * squares
+    for k in range(k_first, k_last):
+        if node_weights[k] > 0.0:
+            for j in range(z.shape[2]):
+                total += node_weights[k] * (z[0, k, j] - reference[0][k, j]) ** 2
     return 0.5 * total
 
 
