@@ -38,9 +38,14 @@ def part_poses(motion, times, R, p):
     rate = np.sqrt(x * x + y * y + z * z)
     if rate > 0.0:
         x, y, z = x / rate, y / rate, z / rate
-    moving = rate > 0.0 or twist[0] != 0.0 or twist[1] != 0.0 or twist[2] != 0.0
+    if rate == 0.0 and twist[0] == 0.0 and twist[1] == 0.0 and twist[2] == 0.0:
+        for a in range(3):
+            p[a, : times.size] = position[a]
+            for b in range(3):
+                R[a, b, : times.size] = rotation[a, b]
+        return
     for s in range(times.size):
-        before = min(times[s] - arrival, 0.0) if moving else 0.0
+        before = min(times[s] - arrival, 0.0)
         c, d = np.sin(rate * before), 2.0 * np.sin(rate * before / 2.0) ** 2
         for a in range(3):
             p[a, s] = position[a] + before * twist[a]
