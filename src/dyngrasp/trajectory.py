@@ -169,22 +169,40 @@ def interpolate(trajectory, times, out):
 
 @njit(cache=True, error_model="numpy")
 def largest_defect(trajectory):
-    """`Trajectory.dynamics_defect`."""
+    """`Trajectory.dynamics_defect`; a NaN is the largest."""
     duration, position, velocity, acceleration = trajectory
     half_step, n = duration / (position.shape[0] - 1) / 2, position.shape[1]
     q, w, v = position.ravel(), velocity.ravel(), acceleration.ravel()
-    return max(_violation(half_step, q[:-n], q[n:], w[:-n], w[n:]), _violation(half_step, w[:-n], w[n:], v[:-n], v[n:]))
+    in_q, in_w = (
+        _violation(half_step, q[:-n], q[n:], w[:-n], w[n:]),
+        _violation(half_step, w[:-n], w[n:], v[:-n], v[n:]),
+    )
+    return largest(np.array([in_q, in_w]))
 
 
-# A maximum becomes vector instructions where nothing can be a NaN; trajectories hold finite numbers only.
-@njit(cache=True, error_model="numpy", fastmath={"nnan", "nsz", "reassoc"})
+@njit(cache=True, error_model="numpy")
 def _violation(half_step, x, x_next, rate, rate_next):
     """Largest |x′ − x − Δt/2 (ẋ′ + ẋ)| of arrays (M,) and their values one grid point later."""
-    most = 0.0
+    defects = np.empty(x.size)
     for i in range(x.size):
-        defect = abs(x_next[i] - x[i] - half_step * (rate_next[i] + rate[i]))
-        most = defect if defect > most else most
-    return most
+        defects[i] = abs(x_next[i] - x[i] - half_step * (rate_next[i] + rate[i]))
+    return largest(defects)
+
+
+_ALL_BUT_SIGN = 0x7FFF_FFFF_FFFF_FFFF
+
+
+@njit(cache=True)
+def largest(values):
+    """Largest of numbers (M,), M ≥ 1; a NaN without a sign is larger than all.
+
+    Read as integers floats keep their order, once the negative ones are turned round. Comparisons of integers become
+    vector instructions, while those of floats do not, for they have to mind NaNs.
+    """
+    bits, most = values.view(np.int64), np.int64(-_ALL_BUT_SIGN)
+    for i in range(bits.size):
+        most = max(most, bits[i] ^ ((bits[i] >> 63) & _ALL_BUT_SIGN))
+    return np.full(1, most ^ ((most >> 63) & _ALL_BUT_SIGN)).view(np.float64)[0]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.part_motion import PartMotion, part_poses
 from dyngrasp.planning.plan_samples import PlanSamples
 from dyngrasp.signals import Array, read_only
+from dyngrasp.trajectory import largest
 
 # A function of the motion departs from the chord between two grid points by about an eighth of its second difference
 # there. An interval in which four times that could break a constraint is suspect.
@@ -300,10 +301,12 @@ def _enter(values, first, sign, times, row):
     Returns:
         (k,) largest of each times `sign`; NaN if there is one.
     """
-    worst, which, highest = -np.inf, 0, np.empty(values.shape[0])
+    worst, which, highest, signed = -np.inf, 0, np.empty(values.shape[0]), np.empty(values.shape[1])
     for j in range(values.shape[0]):
-        total = _total(values[j])
-        highest[j] = _maximum(values[j], sign) if total == total else np.nan
+        for k in range(signed.size):
+            signed[k] = sign * values[j, k]
+        total = _total(signed)
+        highest[j] = largest(signed) if total == total else np.nan
         if not highest[j] <= worst and worst == worst:
             worst, which = highest[j], j
     at = 0
@@ -314,32 +317,22 @@ def _enter(values, first, sign, times, row):
     return highest
 
 
-# Reductions become vector instructions only where their order is free and, for the maximum, no NaN is left.
 @njit(cache=True, fastmath={"reassoc"})
 def _total(row):
+    """Sum of absolute values, in any order; NaN if one of them is."""
     total = 0.0
     for k in range(row.size):
         total += abs(row[k])
     return total
 
 
-@njit(cache=True, fastmath={"nnan", "nsz", "reassoc"})
-def _maximum(row, sign):
-    highest = sign * row[0]
-    for k in range(row.size):
-        value = sign * row[k]
-        highest = value if value > highest else highest
-    return highest
-
-
-@njit(cache=True, fastmath={"nnan", "nsz", "reassoc"})
+@njit(cache=True, error_model="numpy")
 def _largest_bend(row):
-    """Largest second difference of a row without NaN."""
-    largest = 0.0
-    for k in range(1, row.size - 1):
-        bend = abs(row[k - 1] - 2.0 * row[k] + row[k + 1])
-        largest = bend if bend > largest else largest
-    return largest
+    """Largest second difference of a row; NaN if there is one."""
+    bends = np.zeros(max(row.size - 2, 1))
+    for k in range(row.size - 2):
+        bends[k] = abs(row[k] - 2.0 * row[k + 1] + row[k + 2])
+    return largest(bends)
 
 
 @njit(cache=True, error_model="numpy")
