@@ -36,6 +36,18 @@ def read_only(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     return array
 
 
+def vector(values: ArrayLike) -> Array:
+    """`read_only` of one dimension, whatever its length; these are made in every control period.
+
+    Raises:
+        ValueError: Another number of dimensions.
+    """
+    array = read_only(values)
+    if array.ndim != 1:
+        raise ValueError(f"expected a vector, got shape {array.shape}")
+    return array
+
+
 def frozen(array: Array) -> Array:
     """The same array, read-only from now on: for one just made that nobody else holds, so that none has to copy it."""
     array.setflags(write=False)
@@ -65,7 +77,7 @@ class JointState:
 
     def __post_init__(self) -> None:
         for name in ("position", "velocity", "acceleration"):
-            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+            object.__setattr__(self, name, vector(getattr(self, name)))
 
 
 @dataclass(frozen=True)
@@ -109,7 +121,7 @@ class Observation:
 
     def __post_init__(self) -> None:
         for name in ("arm_position", "gripper_position", "pad_force"):
-            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+            object.__setattr__(self, name, vector(getattr(self, name)))
 
 
 @dataclass(frozen=True)
@@ -121,4 +133,4 @@ class Command:
 
     def __post_init__(self) -> None:
         for name in ("arm_torque", "gripper_torque"):
-            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+            object.__setattr__(self, name, vector(getattr(self, name)))

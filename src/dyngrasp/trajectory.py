@@ -80,11 +80,9 @@ class Trajectory:
 
     def sample_as(self, local: float, t: float, at_rest: bool = False) -> JointState:
         """State at `local` (s) under the time `t` (s) of another clock; with velocity and acceleration 0 if at rest."""
-        state = np.empty((3, 1, self.position.shape[1]))
-        interpolate(self.arrays, np.array([local]), state)
-        if at_rest:
-            state[1:] = 0.0
-        return JointState(t, *frozen(state)[:, 0])
+        state = np.empty((3, self.position.shape[1]))
+        _write_state(self.arrays, local, at_rest, state)
+        return JointState(t, *frozen(state))
 
     def sample_many(self, times: ArrayLike) -> tuple[Array, Array, Array]:
         """States between the grid points, consistent with the collocation.
@@ -124,10 +122,13 @@ def largest_difference(a, b):
 
 
 @njit(cache=True)
-def _largest_jump(q_0, w_0, q_1, w_1, q_2, w_2):
-    """Largest jump of positions and velocities (N+1, n) over both joins of three phases."""
-    first = max(largest_difference(q_0[-1], q_1[0]), largest_difference(w_0[-1], w_1[0]))
-    return max(first, max(largest_difference(q_1[-1], q_2[0]), largest_difference(w_1[-1], w_2[0])))
+def _largest_jump(phases):
+    """Largest jump of positions and velocities over both joins of three phases."""
+    largest = 0.0
+    for i in range(2):
+        (_, q, w, _), (_, q_next, w_next, _) = phases[i], phases[i + 1]
+        largest = max(largest, largest_difference(q[-1], q_next[0]), largest_difference(w[-1], w_next[0]))
+    return largest
 
 
 @njit(cache=True, fastmath={"reassoc"})
@@ -140,6 +141,14 @@ def _all_finite(position, velocity, acceleration):
         if rest != 0.0:
             return False
     return True
+
+
+@njit(cache=True, error_model="numpy")
+def _write_state(trajectory, local, at_rest, state):
+    """See `Trajectory.sample_as`; state (3, n)."""
+    interpolate(trajectory, np.full(1, local), state.reshape(3, 1, -1))
+    if at_rest:
+        state[1:] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -249,9 +258,9 @@ class GraspPlan:
                     raise InvalidTrajectory(
                         f"{what}, phase {phase}: {trajectory.position.shape[1]} columns for {len(joints)} joints"
                     )
-            largest = _largest_jump(*(array for phase in phases for array in (phase.position, phase.velocity)))
-            if not largest <= JOIN_TOLERANCE:
-                self._refuse_jump(phases, what)
+        for phases, trajectories, what in zip(self.arrays, (self.arm, self.gripper), ("arm", "gripper"), strict=False):
+            if not _largest_jump(phases) <= JOIN_TOLERANCE:
+                self._refuse_jump(trajectories, what)
         for phase, arm, gripper in zip(PHASE_NAMES, self.arm, self.gripper, strict=True):
             if abs(arm.duration - gripper.duration) > JOIN_TOLERANCE:
                 raise InvalidTrajectory(f"phase {phase}: arm takes {arm.duration} s, gripper {gripper.duration} s")

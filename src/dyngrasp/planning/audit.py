@@ -117,11 +117,11 @@ def _slowest(arm, ends, limit, since, at_ends):
                 w = velocity[k, j]
                 if half % 2:
                     w = (w + velocity[k + 1, j]) / 2 - step / 8 * (acceleration[k + 1, j] - acceleration[k, j])
-                share = abs(w) / limit[j]
-                if not share <= speed and speed == speed:
-                    speed = share
-            # A NaN, once found, stays.
-            if not speed >= least and least == least:
+                speed = max(speed, abs(w) / limit[j])
+                # One fast joint is enough.
+                if speed >= least:
+                    break
+            if speed < least:
                 least, time = speed, t
     return least, time
 

@@ -183,7 +183,7 @@ class Attempt:
 
     def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
         started, started_clock = time.perf_counter(), self.clock()
-        if self.recovery is None:
+        if self.recovery is None or self.recovery.factor >= 1.0:
             report = audit(plan, targets, self.task, self.splice)
         else:
             report = audit(plan, targets, self.task, self.splice, self.recovery.wall(plan))
