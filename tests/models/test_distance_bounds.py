@@ -8,14 +8,16 @@ import trimesh
 
 from dyngrasp.models.bounding_volumes import Pieces, bounding_bodies, bounding_capsule, boxes_around
 from dyngrasp.models.distance_bounds import (
+    add_near_each_other,
+    add_near_ground,
+    add_near_pieces,
+    add_pieces_near_ground,
+    first_of,
     lowest,
-    near_each_other,
-    near_ground,
-    near_pieces,
-    pieces_near_ground,
+    space_for,
     tighten,
 )
-from dyngrasp.models.link_motion import Motion, follow, seen_from
+from dyngrasp.models.link_motion import follow, seen_from
 
 GJK = 1e-6  # m, tolerance of Coal's iterations
 
@@ -84,6 +86,12 @@ def on_links(shapes, links, motions):
     return bodies, R, p, placed
 
 
+def added(add, *arguments):
+    """What one of the functions adds to nothing, where each pair has room."""
+    found = space_for(100, 10000)
+    return first_of(found, add(*arguments, found, 0))
+
+
 def still(samples):
     return [pin.SE3.Identity()] * samples
 
@@ -117,9 +125,9 @@ def test_bounds_to_pieces_and_their_neighbours(name, seed):
     half = random.uniform(0.02, 0.08, (2, 3))
     centres = random.normal(size=(2, 3)) * 0.03
     pieces = boxes_around([centres[i] + np.vstack([-half[i], half[i]]) for i in range(2)], 7)
-    seen = Motion(*follow(*seen_from(R[-1], p[-1], R, p), np.vstack([bodies.link_ends.mean(axis=1)])))
+    seen = follow(*seen_from(R[-1], p[-1], R, p), np.vstack([bodies.link_ends.mean(axis=1)]))
     start, stop = 3, samples - 4
-    found = near_pieces(seen, bodies, pieces, np.array([[start, stop], [samples, samples]]), horizon)
+    found = added(add_near_pieces, seen, bodies, pieces, np.array([[start, stop], [samples, samples]]), horizon)
     exact = {
         (0, 7 + i): np.array(
             [
@@ -154,8 +162,8 @@ def test_bounds_between_capsules_are_exact_where_they_are_apart(seed):
     motions = [still(samples), *(walk(random, samples, 0.15) for _ in range(3))]
     shapes, links = [SHAPES[name] for name in ("capsule", "sphere", "cylinder", "convex")], [1, 2, 3, 3]
     bodies, R, p, placed = on_links(shapes, links, motions)
-    world = Motion(*follow(R, p, bodies.link_ends.mean(axis=1)))
-    found = near_each_other(world, bodies, np.array([[1, 2], [1, 3], [2, 3]]), horizon)
+    world = follow(R, p, bodies.link_ends.mean(axis=1))
+    found = added(add_near_each_other, world, bodies, np.array([[1, 2], [1, 3], [2, 3]]), horizon)
     exact = {
         (i, j): np.array([distance(shapes[i], placed[i][k], shapes[j], placed[j][k]) for k in range(samples)])
         for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3))
@@ -182,7 +190,7 @@ def test_parallel_and_crossing_segments():
             shapes, placements = [rod, shape], [pin.SE3(along, np.zeros(3)), placement]
             bodies = bounding_bodies([shapes[i] for i in pair], [placements[i] for i in pair], np.array([0, 1]), 2)
             R, p = (np.stack(column) for column in zip(arrays(still(1)), arrays(still(1)), strict=True))
-            found = near_each_other(Motion(*follow(R, p, np.zeros((2, 3)))), bodies, np.array([[0, 1]]), 10.0)
+            found = added(add_near_each_other, follow(R, p, np.zeros((2, 3))), bodies, np.array([[0, 1]]), 10.0)
             np.testing.assert_allclose(found.bounds, expected, atol=3 * thin)
 
 
@@ -192,22 +200,35 @@ def test_heights_are_those_of_the_lowest_points():
     motions = [still(samples), walk(random, samples, 0.3), walk(random, samples, 0.2)]
     bodies, R, p, placed = on_links([SHAPES["capsule"], SHAPES["box"]], [1, 1], motions)
     ground = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-    world = Motion(*follow(R, p, bodies.link_ends.mean(axis=1)))
+    world = follow(R, p, bodies.link_ends.mean(axis=1))
     shapes, everywhere = [SHAPES["capsule"], SHAPES["box"]], np.ones(samples, dtype=bool)
     exact = {
         (i, -1): np.array([distance(shapes[i], T, ground, pin.SE3.Identity()) for T in placed[i]]) for i in range(2)
     }
-    bounds = check(near_ground(world, bodies, horizon), exact, horizon, everywhere)
+    bounds = check(added(add_near_ground, world, bodies, horizon), exact, horizon, everywhere)
     known = bounds[0, -1] < np.inf
     assert known.any()
     np.testing.assert_allclose(bounds[0, -1][known], exact[0, -1][known], atol=1e-12)
     half = np.array([0.01, 0.07, 0.03])
     pieces: Pieces = boxes_around([np.vstack([-half, half])], 5)
-    found = pieces_near_ground(world, pieces, 4, horizon)
+    found = added(add_pieces_near_ground, world, pieces, 4, horizon)
     exact = {(5, -1): np.array([distance(SHAPES["box"], T, ground, pin.SE3.Identity()) for T in motions[-1]])}
     bounds = check(found, exact, horizon, np.arange(samples) >= 4)
     known = bounds[5, -1] < np.inf
     np.testing.assert_allclose(bounds[5, -1][known], exact[5, -1][known], atol=1e-12)
+    # Without room for all there is no answer.
+    few = space_for(1, 10000), space_for(100, samples)
+    assert [add_near_ground(world, bodies, horizon, found, 0) for found in few] == [-1, -1]
+    assert add_pieces_near_ground(world, pieces, 4, horizon, few[1], -1) == -1
+    # What is added later leaves what was there and comes after it.
+    both = space_for(100, 10000)
+    first = add_near_ground(world, bodies, horizon, both, 0)
+    both = first_of(both, add_pieces_near_ground(world, pieces, 4, horizon, both, first))
+    alone = first_of(both, first)
+    np.testing.assert_array_equal(both.pairs[first:], found.pairs)
+    np.testing.assert_array_equal(both.samples[both.stops[first] :], found.samples)
+    np.testing.assert_array_equal(both.bounds[both.stops[first] :], found.bounds)
+    np.testing.assert_array_equal(alone.bounds, added(add_near_ground, world, bodies, horizon).bounds)
 
 
 def test_volumes_around_links_contain_their_bodies():

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import coal  # pyright: ignore[reportMissingImports]  # comes with Pinocchio, reached through a path file
 import numpy as np
@@ -14,8 +13,7 @@ from numpy.typing import NDArray
 from dyngrasp.signals import Array, read_only
 
 
-@dataclass(frozen=True, eq=False)
-class Bodies:
+class Bodies(NamedTuple):
     """Volumes around B bodies on F links, each in the frame of its link (m); make it with `bounding_bodies`.
 
     Attributes:
@@ -46,8 +44,7 @@ class Bodies:
     link_reaches: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Pieces:
+class Pieces(NamedTuple):
     """Boxes around the P convex pieces of a part, in the frame of the part (m).
 
     Attributes:
@@ -179,11 +176,11 @@ def lowest_corner(R, p, low, high, s):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def segment_gap(R, p, ends, s, low, high):
-    """Distance (m) of a box from the one along the same axes around a segment on a link; −inf if they overlap."""
+def segment_gap(R, p, ends, s, corners):
+    """Distance (m) of a box (2, 3) from the one along its axes around a segment on a link; −inf if they overlap."""
     gap, one, other = 0.0, point_at(R, p, ends[0], s), point_at(R, p, ends[1], s)
     for a in range(3):
-        d = max(low[a] - max(one[a], other[a]), min(one[a], other[a]) - high[a], 0.0)
+        d = max(corners[0, a] - max(one[a], other[a]), min(one[a], other[a]) - corners[1, a], 0.0)
         gap += d * d
     return np.sqrt(gap) if gap > 0.0 else -np.inf
 

@@ -5,7 +5,7 @@ The index of the sample is the last of every array; the compiled functions take 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,8 +16,7 @@ from dyngrasp.signals import Array
 STILL = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
+class Motion(NamedTuple):
     """How F links move through S samples, seen from one frame.
 
     A point that is ρ away from the middle of its link has covered `shift` + ρ `turn` since the first sample, at most.
@@ -41,7 +40,7 @@ class Motion:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def follow(R, p, middles):
-    """The arrays of `Motion` for poses of links (F, 3, 3, S), (F, 3, S) and the middles of their bodies (F, 3)."""
+    """`Motion` for poses of links (F, 3, 3, S), (F, 3, S) and the middles of their bodies (F, 3)."""
     links, samples = p.shape[0], p.shape[2]
     shift, turn = np.zeros((links, samples)), np.zeros((links, samples))
     row = np.empty(samples)
@@ -62,7 +61,7 @@ def follow(R, p, middles):
             path += shift[k, s]
             angle += turn[k, s]
             shift[k, s], turn[k, s] = path, angle
-    return R, p, shift, turn
+    return Motion(R, p, shift, turn)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")

@@ -112,11 +112,10 @@ class CellGeometry:
             waypoints: Samples of a plan.
             part: Where the part is until it is lifted.
         """
-        world, seen, finite = _motions(
+        return _motions(
             waypoints.q, waypoints.q_h, waypoints.times, waypoints.lifted, self._indices, self._tree.tree,
             self._hanging, self.middles, part,
         )  # fmt: skip
-        return Motion(*world), Motion(*seen), finite
 
     def distance(self, i: int, j: int, R: Array, p: Array, k: int) -> float:
         """Exact distance of two bodies (m) at sample k of links (F, 3, 3, S), (F, 3, S) in the world."""
@@ -152,7 +151,7 @@ def _convex(path: Path) -> tuple[coal.Convex, Array]:
 
 @njit(cache=True, error_model="numpy")
 def _motions(q, q_h, times, lifted, indices, tree, hanging, middles, part):
-    """Both motions as arrays, and whether they are finite."""
+    """See `CellGeometry.motions`."""
     arm_indices, hand_indices = indices
     both = side_by_side(q, q_h, arm_indices, hand_indices)
     R, p = np.empty((middles.shape[0], 3, 3, times.size)), np.empty((middles.shape[0], 3, times.size))
@@ -167,5 +166,5 @@ def _motions(q, q_h, times, lifted, indices, tree, hanging, middles, part):
     seen_R, seen_p = seen_from(R[-1], p[-1], R, p)
     world, seen = follow(R, p, middles), follow(seen_R, seen_p, middles)
     # Comparisons would lose a NaN on the way to the least distance; the paths are sums over all of them.
-    covered = world[2][:, -1].sum() + world[3][:, -1].sum()
+    covered = world.shift[:, -1].sum() + world.turn[:, -1].sum()
     return world, seen, np.isfinite(covered + times.sum() + p[:, :, 0].sum())

@@ -7,17 +7,23 @@ what it shows bounds the samples around it; it ends when no bound is below the l
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from dyngrasp.models.distance_bounds import (
     Candidates,
+    add_near_each_other,
+    add_near_ground,
+    add_near_pieces,
+    add_pieces_near_ground,
+    first_of,
     lowest,
-    near_each_other,
-    near_ground,
-    near_pieces,
     nearest_pair,
-    pieces_near_ground,
+    space_for,
     tighten,
 )
 from dyngrasp.models.link_motion import Motion
@@ -34,6 +40,9 @@ HORIZON = 0.05
 
 # The part stands on the ground when it is lifted; its own pieces may reach this far below z = 0 by rounding (m).
 RESTING_TOLERANCE = 5e-4
+
+# Most plans have fewer pairs that come near; room for all there could be takes longer to come by than to look at them.
+_FEW = 128
 
 # Coal's iterations stop within this of the distance (m); bounds that are nearer to each other say nothing.
 RESOLUTION = 1e-6
@@ -82,18 +91,21 @@ def _checked(cell: CellGeometry, waypoints: Waypoints, world: Motion, seen: Moti
 
     `HORIZON`, the first sample and nobody if nothing comes nearer than that.
     """
-    bodies, pieces, lifted = cell.bodies, cell.pieces, waypoints.lifted
-    windows = _windows(bodies.links, cell.is_pad, cell.on_arm, waypoints.closing, lifted, waypoints.times.size)
-    nobody = HORIZON, 0, ""
+    closing, lifted = waypoints.closing, waypoints.lifted
+    windows = _windows(cell.bodies.links, cell.is_pad, cell.on_arm, closing, lifted, waypoints.times.size)
+    found, least, groups = _candidates(world, seen, cell.bodies, cell.pieces, cell.link_pairs, windows, lifted)
+    taken, ground, itself, lifted_part, arm_at_part = itertools.pairwise(groups)
+    search, nobody = Search(cell, world, found, least), (HORIZON, 0, "")
     # When the part is taken the hand is nearer to it than on the way: what is farther then need not be looked at.
-    closest = _nearest(cell, near_pieces(seen, bodies, pieces, windows[0], HORIZON), seen, world, nobody)
-    carried = _nearest(cell, pieces_near_ground(world, pieces, lifted, HORIZON), world, world, (HORIZON, lifted, ""))
+    closest = search.nearest(taken, seen, nobody)
+    on_the_way, at = _candidates_at_part(seen, cell.bodies, cell.pieces, windows[1], closest[0])
+    carried = search.nearest(lifted_part, world, (HORIZON, lifted, ""))
     return [
-        _nearest(cell, near_ground(world, bodies, HORIZON), world, world, nobody),
-        _nearest(cell, near_pieces(seen, bodies, pieces, windows[1], closest[0]), seen, world, closest),
-        _nearest(cell, near_each_other(world, bodies, cell.link_pairs, HORIZON), world, world, nobody),
+        search.nearest(ground, world, nobody),
+        Search(cell, world, on_the_way, at).nearest((0, at.size), seen, closest),
+        search.nearest(itself, world, nobody),
         # The part hangs in the gripper only from the lift on.
-        _nearest(cell, near_pieces(seen, bodies, pieces, windows[2], carried[0]), seen, world, carried),
+        search.nearest(arm_at_part, seen, carried),
     ]
 
 
@@ -113,24 +125,80 @@ def _windows(links, is_pad, on_arm, closing, lifted, samples):
     return windows
 
 
-def _nearest(cell: CellGeometry, found: Candidates, motion: Motion, world: Motion, best: Nearest) -> Nearest:
-    """The nearest of some pairs, or `best` if none comes nearer than that; `motion` is what their bounds rest on."""
-    if not len(found.pairs):
+@njit(cache=True)
+def _candidates(world, seen, bodies, pieces, link_pairs, windows, lifted):
+    """Pairs within `HORIZON`, the lowest bound of each, and where the pairs of each kind begin and the last ones end.
+
+    First those of the hand and the part as it is taken, then of arm and hand with the ground, with themselves, of the
+    lifted part with the ground, with the arm.
+    """
+    samples, bodies_by_pieces = world.p.shape[2], bodies.radii.size * pieces.reaches.size
+    most = 2 * bodies_by_pieces + bodies.radii.size * (bodies.radii.size + 1) + pieces.reaches.size
+    for pairs in (_FEW, most):
+        found = space_for(pairs, pairs * samples)
+        taken = add_near_pieces(seen, bodies, pieces, windows[0], HORIZON, found, 0)
+        ground = add_near_ground(world, bodies, HORIZON, found, taken)
+        itself = add_near_each_other(world, bodies, link_pairs, HORIZON, found, ground)
+        lifted_part = add_pieces_near_ground(world, pieces, lifted, HORIZON, found, itself)
+        arm = add_near_pieces(seen, bodies, pieces, windows[2], HORIZON, found, lifted_part)
+        if arm >= 0:
+            break
+    found = first_of(found, arm)
+    return found, lowest(found.stops, found.bounds), (0, taken, ground, itself, lifted_part, arm)
+
+
+@njit(cache=True)
+def _candidates_at_part(seen, bodies, pieces, window, horizon):
+    """Pairs of the hand and the part within a horizon (m), and the lowest bound of each."""
+    samples, count = seen.p.shape[2], 0
+    for pairs in (_FEW, bodies.radii.size * pieces.reaches.size):
+        found = space_for(pairs, pairs * samples)
+        count = add_near_pieces(seen, bodies, pieces, window, horizon, found, 0)
+        if count >= 0:
+            break
+    found = first_of(found, count)
+    return found, lowest(found.stops, found.bounds)
+
+
+@dataclass
+class Search:
+    """Exact distances of some pairs of bodies, nearest first; each that is measured raises the bounds of its pair.
+
+    Attributes:
+        cell: The bodies.
+        world: Motion of their links as seen from the world.
+        found: Pairs and the bounds of their distances.
+        least: (K,) of `lowest`.
+    """
+
+    cell: CellGeometry
+    world: Motion
+    found: Candidates
+    least: NDArray[np.int64]
+
+    def nearest(self, group: tuple[int, int], motion: Motion, best: Nearest) -> Nearest:
+        """The nearest of the pairs from one to another, or `best` if none comes nearer than that.
+
+        Args:
+            group: First pair, and one after the last.
+            motion: What their bounds rest on.
+            best: What is known already.
+        """
+        cell, world, found, least = self.cell, self.world, self.found, self.least
+        while group[0] < group[1]:
+            pair, bound = nearest_pair(least, found.bounds, *group)
+            if bound >= best[0] - RESOLUTION:
+                break
+            i, j = found.pairs[pair].tolist()
+            k = int(found.samples[least[pair]])
+            distance = cell.distance(i, j, world.R, world.p, k)
+            if not distance >= best[0]:
+                best = distance, k, f"{cell.names[i]} and {cell.names[j]}"
+            own = slice(found.stops[pair], found.stops[pair + 1])
+            one, other = (motion.path(cell.links[body], cell.reaches[body]) for body in (i, j))
+            at = least[pair] - own.start
+            least[pair] = own.start + tighten(found.samples[own], found.bounds[own], one, other, at, distance)
         return best
-    least = lowest(found.stops, found.bounds)
-    while True:
-        pair, bound = nearest_pair(least, found.bounds)
-        if bound >= best[0] - RESOLUTION:
-            return best
-        i, j = found.pairs[pair].tolist()
-        k = int(found.samples[least[pair]])
-        distance = cell.distance(i, j, world.R, world.p, k)
-        if not distance >= best[0]:
-            best = distance, k, f"{cell.names[i]} and {cell.names[j]}"
-        own = slice(found.stops[pair], found.stops[pair + 1])
-        one, other = (motion.path(cell.links[body], cell.reaches[body]) for body in (i, j))
-        at = least[pair] - own.start
-        least[pair] = own.start + tighten(found.samples[own], found.bounds[own], one, other, at, distance)
 
 
 def _sunk(task: GraspTask, targets: GraspTargets) -> float:
