@@ -48,7 +48,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "duration", float(self.duration))
-        q, w, v = (read_only(array) for array in (self.position, self.velocity, self.acceleration))
+        q, w, v = read_only(self.position), read_only(self.velocity), read_only(self.acceleration)
         for name, array in (("position", q), ("velocity", w), ("acceleration", v)):
             object.__setattr__(self, name, array)
         if not (q.shape == w.shape == v.shape and q.ndim == 2 and len(q) >= 2):
@@ -58,6 +58,12 @@ class Trajectory:
             raise InvalidTrajectory(f"duration must be a positive number of seconds, got {self.duration}")
         if not _all_finite(q, w, v):
             raise InvalidTrajectory("a trajectory holds finite numbers only")
+
+    @classmethod
+    def of(cls, duration: float, motion: Array) -> Trajectory:
+        """A trajectory of q, q̇, q̈ in one array (3, N+1, n), just made, that nobody else holds: it becomes read-only."""
+        # Not by unpacking: an array that is iterated over ends with an exception and its message.
+        return cls(duration, frozen(motion)[0], motion[1], motion[2])
 
     @property
     def arrays(self) -> PhaseArrays:
@@ -82,7 +88,7 @@ class Trajectory:
         """State at `local` (s) under the time `t` (s) of another clock; with velocity and acceleration 0 if at rest."""
         state = np.empty((3, self.position.shape[1]))
         _write_state(self.arrays, local, at_rest, state)
-        return JointState(t, *frozen(state))
+        return JointState(t, frozen(state)[0], state[1], state[2])
 
     def sample_many(self, times: ArrayLike) -> tuple[Array, Array, Array]:
         """States between the grid points, consistent with the collocation.
@@ -101,8 +107,7 @@ class Trajectory:
         times = np.asarray(times, dtype=float)
         out = np.empty((3, times.size, self.position.shape[1]))
         interpolate(self.arrays, times, out)
-        q, w, v = frozen(out)
-        return q, w, v
+        return frozen(out)[0], out[1], out[2]
 
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""

@@ -67,7 +67,7 @@ def nearest_trajectory(problem: PhaseProblem, curvature: Array, duration: float)
 def _meeting_ends(problem: PhaseProblem, duration: float, motion: Array) -> Trajectory:
     """`nearest_trajectory` in place of its accelerations in normalised time, the last part of (3, N+1, n)."""
     _meet_ends(*_straight(problem.intervals), _ends(problem), duration, motion)
-    return Trajectory(duration, *frozen(motion))
+    return Trajectory.of(duration, motion)
 
 
 @lru_cache(maxsize=64)
@@ -282,7 +282,7 @@ def optimum_through(
     rows, gram_inverse, shares = _map(problem.intervals, nodes)
     motion = np.zeros((3, problem.intervals + 1, problem.joints))
     _meet_ends(rows[best], gram_inverse[best], shares[best], waypoints, _ends(problem), duration, motion)
-    return Trajectory(duration, *frozen(motion)), cost
+    return Trajectory.of(duration, motion), cost
 
 
 def _reach_row(intervals: int, node: int) -> Array:

@@ -22,7 +22,7 @@ from dyngrasp.errors import OutOfReach
 from dyngrasp.models.flange_chain import place_frames
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.replanning.target_update import target_updater
-from dyngrasp.signals import Array, frozen, read_only
+from dyngrasp.signals import Array, read_only
 from dyngrasp.trajectory import Trajectory
 
 _KNOTS = 4
@@ -87,7 +87,7 @@ def carried_descent(
     bent = (position, reference.velocity, reference.acceleration)
     _bend(bent, entry, T, _lagrange(entry, N), knots, postures, motion)
     weights[entry:] = (settings.stiffness / ((1 - entry / N) * T)) ** 4
-    return Trajectory(T, *frozen(motion)), weights
+    return Trajectory.of(T, motion), weights
 
 
 def _from_end(targets: GraspTargets | None, start: float, duration: float, N: int, knots: tuple[int, ...]) -> Array:

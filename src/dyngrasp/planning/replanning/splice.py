@@ -72,7 +72,7 @@ def rest_of(trajectory: Trajectory, start: float, intervals: int) -> Trajectory:
     """What is left of a motion after `start` (s), on a grid of its own; obeys the trapezoidal rule only nearly."""
     motion = np.empty((3, intervals + 1, trajectory.position.shape[1]))
     _write_rest(trajectory.duration, trajectory.position, trajectory.velocity, trajectory.acceleration, start, motion)
-    return Trajectory(trajectory.duration - start, *frozen(motion))
+    return Trajectory.of(trajectory.duration - start, motion)
 
 
 @njit(cache=True, error_model="numpy")
