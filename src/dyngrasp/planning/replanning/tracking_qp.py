@@ -89,8 +89,8 @@ class TrackingProblem:
         n = self.reference.position.shape[1]
         if self.reference.intervals < MIN_INTERVALS:
             raise InvalidProblem(f"at least {MIN_INTERVALS} grid intervals, got {self.reference.intervals}")
-        if np.shape(self.start) != (3, n) or np.shape(self.end) != (3, n):
-            raise InvalidProblem(f"states of shape (3, {n}) expected, got {np.shape(self.start)}, {np.shape(self.end)}")
+        if self.start.shape != (3, n) or self.end.shape != (3, n):
+            raise InvalidProblem(f"states of shape (3, {n}) expected, got {self.start.shape}, {self.end.shape}")
         if not 0 < self.min_duration <= self.max_duration < np.inf:
             raise InvalidProblem(f"durations 0 < min ≤ max < ∞ expected: {self.min_duration}, {self.max_duration} s")
 
