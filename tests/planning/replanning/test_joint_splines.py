@@ -11,7 +11,10 @@ from dyngrasp.planning.replanning.joint_splines import (
     push_forward,
     sequence,
     substitute,
+    substitute_both,
+    unknowns_of,
 )
+from dyngrasp.planning.replanning.lanes import whole_lanes
 
 RNG = np.random.default_rng(0)
 
@@ -70,31 +73,65 @@ def test_taps_and_bands_are_those_of_the_full_map(held, ends_cost):
         assert np.abs(band - lower).max() < 1e-12 * np.abs(gram).max()
 
 
-def test_pull_back_is_the_transpose_of_push_forward():
-    N, n = 12, 2
+def padded(rows):
+    """Rows of whole lanes with zeros behind the joints."""
+    wide = np.zeros((*rows.shape[:-1], whole_lanes(rows.shape[-1])))
+    wide[..., : rows.shape[-1]] = rows
+    return wide
+
+
+@pytest.mark.parametrize("n", [2, 8, 11])
+@pytest.mark.parametrize("N", [4, 12])
+def test_pull_back_is_the_transpose_of_push_forward(N, n):
     _, taps, _ = filters(N, True, False, True)
-    dx, dual = RNG.normal(size=(N - 1, n)), RNG.normal(size=(3, N + 1, n))
-    z, gradient = np.zeros((3, N + 1, n)), np.empty((N - 1, n))
+    dx, dual = padded(RNG.normal(size=(N - 1, n))), padded(RNG.normal(size=(3, N + 1, n)))
+    z, gradient = np.zeros_like(dual), np.zeros_like(dx)
     push_forward(taps, dx, z)
-    pull_back(taps, dual, gradient)
+    for kind in range(3):
+        pull_back(kind, taps, dual[kind], gradient)
     assert np.isclose((z * dual).sum(), (dx * gradient).sum(), rtol=1e-12)
 
 
+@pytest.mark.parametrize("N", [4, 12])
+def test_push_forward_is_the_sequence_of_a_motion_that_rests_at_its_ends(N):
+    dx = padded(RNG.normal(size=(N - 1, 3)))
+    _, taps, _ = filters(N, False, False, True)
+    r, z, expected = np.empty((N + 3, 8)), np.zeros((3, N + 1, 8)), np.empty((3, N + 1, 8))
+    push_forward(taps, dx, z)
+    sequence(dx, np.zeros((2, 3, 8)), (False, False), r)
+    filtered(r, expected)
+    assert np.abs(z - expected).max() < 1e-14 * N**2
+
+
+def test_unknowns_of_a_sequence_are_those_that_it_was_made_of():
+    N, T = 9, 1.7
+    x, values = padded(RNG.normal(size=(N - 1, 3))), padded(RNG.normal(size=(2, 3, 3)))
+    r, z, found = np.empty((N + 3, 8)), np.empty((3, N + 1, 8)), np.empty_like(x)
+    sequence(x, values, (False, False), r)
+    filtered(r, z)
+    z[2] /= T**2  # q̈ of a
+    unknowns_of(z, T, found)
+    assert np.abs(found - x).max() < 1e-13
+
+
 @pytest.mark.parametrize("size", [3, 4, 40])
-def test_factorisation_solves_pentadiagonal_systems(size):
-    n = 5
+@pytest.mark.parametrize("n", [5, 8, 11])
+def test_factorisation_solves_pentadiagonal_systems(size, n):
     matrices = np.zeros((n, size, size))
     for j in range(n):
         B = np.tril(np.triu(RNG.normal(size=(size, size)), -2))
         matrices[j] = B @ B.T + size * np.eye(size)
-    band = np.zeros((size, 3, n))
+    matrices = np.array([np.tril(np.triu(m, -2), 2) for m in matrices])
+    band = np.zeros((size, 3, whole_lanes(n)))
+    band[:, 0] = 1.0
     for j in range(n):
         for d in range(3):
             band[: size - d, d, j] = np.diagonal(matrices[j], -d)
-    matrices = np.array([np.tril(np.triu(m, -2), 2) for m in matrices])
-    b = RNG.normal(size=(size, n))
-    x = b.copy()
+    b, c = RNG.normal(size=(2, size, n))
+    x, y, z = padded(b), padded(b), padded(c)
     factorise(band)
     substitute(band, x)
-    expected = np.array([np.linalg.solve(matrices[j], b[:, j]) for j in range(n)]).T
-    assert np.abs(x - expected).max() < 1e-12
+    substitute_both(band, y, z)
+    for side, solution in ((b, x), (b, y), (c, z)):
+        expected = np.array([np.linalg.solve(matrices[j], side[:, j]) for j in range(n)]).T
+        assert np.abs(solution - padded(expected)).max() < 1e-12

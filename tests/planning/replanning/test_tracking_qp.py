@@ -134,7 +134,7 @@ def kkt_residuals(p, solution):
     N, n = reference.intervals, reference.position.shape[1]
     ends = np.stack([p.start, p.end])
     held = (p.hold_start_acceleration, p.hold_end_acceleration)
-    motion = (reference.position, reference.velocity, reference.acceleration)
+    motion = np.stack([reference.position, reference.velocity, reference.acceleration])
 
     def scaled(x, T):
         values, slopes = np.empty((2, 3, n)), np.empty((2, 3, n))

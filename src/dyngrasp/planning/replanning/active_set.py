@@ -20,6 +20,7 @@ from dyngrasp.planning.replanning.joint_splines import (
     Indices,
     factorise,
     product,
+    spread_band,
     substitute,
     substitute_both,
     subtract,
@@ -49,24 +50,24 @@ def newton_matrix(
     band: Array,
     column: Array,
 ) -> float:
-    """Write the bands (N−1, 3, n) and the column of T (N−1, n) of ∇²f + Gᵀ Ω G; return the corner of T.
+    """Write the bands (N−1, 3, W) and the column of T (N−1, W) of ∇²f + Gᵀ Ω G; return the corner of T.
 
     Rows and the derivatives of the cost are those of `interior_point`.
     """
-    _, n = column.shape
-    write(1.0, base, band)
+    _, width = column.shape
+    spread_band(base, band)
     write(1.0, base_column, column)
     flat_band, flat_column = band.ravel(), column.ravel()
     for i in range(used):
         if omega[i] > 0.0:
             corner += omega[i] * cs[i] * cs[i]
             # The same place in an array of three numbers an unknown: (f, 0, j) instead of (f, j).
-            in_band = 3 * at[i] - 2 * (at[i] % n)
+            in_band = 3 * at[i] - 2 * (at[i] % width)
             for b in range(TAPS):
                 weight = omega[i] * along[i, b]
-                flat_column[at[i] + b * n] += cs[i] * weight
+                flat_column[at[i] + b * width] += cs[i] * weight
                 for d in range(TAPS - b):
-                    flat_band[in_band + (3 * b + d) * n] += weight * along[i, b + d]
+                    flat_band[in_band + (3 * b + d) * width] += weight * along[i, b + d]
     return corner
 
 
@@ -105,22 +106,22 @@ def finish(
         g: Values of the rows.
         lam: Their multipliers, overwritten by those of the optimum if it is found.
         active: Which rows are thought to be active, overwritten.
-        residual: (N−1, n) ∇f − Gᵀ λ.
+        residual: (N−1, W) ∇f − Gᵀ λ.
         residual_T: The same by T.
         base: See `interior_point`.
         base_column: See there.
         corner: See there.
         free_T: Whether T is a variable.
-        band: (N−1, 3, n), overwritten.
-        column: (N−1, n), overwritten.
-        solved: (N−1, n), overwritten.
-        step: (N−1, n), overwritten by the step of the unknowns.
+        band: (N−1, 3, W), overwritten.
+        column: (N−1, W), overwritten.
+        solved: (N−1, W), overwritten.
+        step: (N−1, W), overwritten by the step of the unknowns.
         omega: As many as rows, overwritten.
 
     Returns:
         Whether the optimum was found, and the step of T.
     """
-    n = step.shape[1]
+    width = step.shape[1]
     flat_step = step.ravel()
     new = lam[:used].copy()
     for _ in range(rounds):
@@ -137,7 +138,7 @@ def finish(
                 y = new[i] - lam[i] - omega[i] * g[i]
                 step_T += y * cs[i]
                 for b in range(TAPS):
-                    flat_step[at[i] + b * n] += y * along[i, b]
+                    flat_step[at[i] + b * width] += y * along[i, b]
             if polish == 0 and free_T:
                 write(1.0, column, solved)
                 substitute_both(band, solved, step)
@@ -153,7 +154,7 @@ def finish(
             for i in range(used):
                 value = g[i] + cs[i] * step_T
                 for b in range(TAPS):
-                    value += along[i, b] * flat_step[at[i] + b * n]
+                    value += along[i, b] * flat_step[at[i] + b * width]
                 if active[i]:
                     new[i] -= penalty * value
                     worst = max(worst, abs(value))

@@ -68,20 +68,20 @@ def interior_point(
     """Mehrotra's predictor–corrector from a point that minimises the cost without rows.
 
     Args:
-        codes: Rows to impose; appended to. Those of T are always imposed where T is free.
+        codes: Rows to impose, see `box_rows`; appended to. Those of T are always imposed where T is free.
         rows: How many codes there are at first.
         a_ends: See `collect`.
         first: Of `filters`.
         taps: Of `filters`.
-        base: (N−1, 3, n) bands of the Hessian of the cost.
-        base_column: (N−1, n) derivatives of its gradient by T.
+        base: (N−1, 3) bands of the Hessian of the cost, the same for all joints.
+        base_column: (N−1, W) derivatives of its gradient by T.
         corner: Second derivative of the cost by T.
         g_T: First derivative of the cost by T at the start; that by the unknowns is zero there.
-        slope: (3, K, n) how q, w, a change with T at constant x.
-        dx: (N−1, n), added to: the steps taken.
+        slope: (3, K, W) how q, w, a change with T at constant x.
+        dx: (N−1, W), added to: the steps taken.
         T: At the start (s).
         T_lin: Where the rows are linear (s).
-        z: (3, K, n) q, w, a at the start, overwritten by those in the end.
+        z: (3, K, W) q, w, a at the start, overwritten by those in the end.
         boxes: See `bound`.
         rates: See `bound`.
         duration: Bounds of T (s).
@@ -94,16 +94,16 @@ def interior_point(
     Returns:
         Outcome, T, iterations, number of rows in the end.
     """
-    _, K, n = z.shape
+    _, K, width = z.shape
     size = K - 2
-    all_rows = 6 * K * n
+    all_rows = 6 * K * boxes.shape[1]
     m = all_rows + 2
-    # A row is g = … + cs T + Σ_b along[b] x[f + b, j]: three unknowns of a joint, n apart in memory from `at` on.
+    # A row is g = … + cs T + Σ_b along[b] x[f + b, j]: three unknowns of a joint, W apart in memory from `at` on.
     at, along, cs, g = np.empty(m, np.int64), np.empty((m, TAPS)), np.empty(m), np.empty(m)
     imposed, found = np.zeros(all_rows, np.bool_), np.empty(all_rows, np.int64)
     for i in range(rows):
         imposed[codes[i]] = True
-    impose(codes, 0, rows, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
+    impose(codes, 0, rows, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
     shortest, longest = duration
     cs[rows], cs[rows + 1] = 1.0 / longest, -1.0 / longest
     g[rows], g[rows + 1] = (T - shortest) / longest, (longest - T) / longest
@@ -120,14 +120,14 @@ def interior_point(
     for i in range(used):
         s[i] = max(g[i], floor)
         lam[i] = mu / s[i]
-    band, column, solved = np.empty((size, 3, n)), np.empty((size, n)), np.empty((size, n))
-    step, step_T = np.empty((size, n)), 0.0
+    band, column, solved = np.empty((size, 3, width)), np.empty((size, width)), np.empty((size, width))
+    step, step_T = np.empty((size, width)), 0.0
     # ∇f − Gᵀ λ: each step takes its length of what is left.
-    residual = np.zeros((size, n))
-    residual_T = g_T - scatter(lam, -1.0, 0, used, n, at, along, cs, residual.ravel())
+    residual = np.zeros((size, width))
+    residual_T = g_T - scatter(lam, -1.0, 0, used, width, at, along, cs, residual.ravel())
     flat_step = step.ravel()
     # Steps that z has not followed yet: it is asked for only when rows are looked for.
-    ahead, ahead_T = np.zeros((size, n)), 0.0
+    ahead, ahead_T = np.zeros((size, width)), 0.0
     outcome = ITERATION_LIMIT
     iterations = 0
     look_below, finish_below = LOOK_BELOW, FINISH_BELOW
@@ -154,12 +154,12 @@ def interior_point(
                 for array in (s, lam, g, cs):
                     array[new], array[new + 1] = array[rows], array[rows + 1]
                 at[new : new + 2], along[new : new + 2] = 0, 0.0
-                impose(codes, rows, new, n, K, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
+                impose(codes, rows, new, T, T_lin, z, slope, boxes, rates, first, taps, at, along, cs, g)
                 for i in range(rows, new):
                     s[i] = max(g[i], LOOK_NEAR)
                     lam[i] = mean / s[i]
                     primal = max(primal, abs(g[i] - s[i]))
-                residual_T -= scatter(lam, -1.0, rows, new, n, at, along, cs, residual.ravel())
+                residual_T -= scatter(lam, -1.0, rows, new, width, at, along, cs, residual.ravel())
                 used += new - rows
                 rows = new
         if not np.isfinite(mean + primal + residual_T):
@@ -216,7 +216,7 @@ def interior_point(
                 second = sigma_mu - ds[i] * dlam[i] if corrected == 1 else 0.0
                 dlam[i] = second * per_s[i] - omega[i] * (g[i] - s[i]) - lam[i]
             write(-1.0, residual, step)
-            step_T = -residual_T + scatter(dlam, 1.0, 0, used, n, at, along, cs, flat_step)
+            step_T = -residual_T + scatter(dlam, 1.0, 0, used, width, at, along, cs, flat_step)
             if corrected == 0 and free_T:
                 write(1.0, column, solved)
                 substitute_both(band, solved, step)
@@ -233,7 +233,7 @@ def interior_point(
             for i in range(used):
                 change = cs[i] * step_T
                 for b in range(TAPS):
-                    change += along[i, b] * flat_step[at[i] + b * n]
+                    change += along[i, b] * flat_step[at[i] + b * width]
                 ds[i] = change + g[i] - s[i]
                 dlam[i] -= omega[i] * change
                 shrink_primal = max(shrink_primal, -ds[i] * per_s[i])
@@ -265,7 +265,7 @@ def interior_point(
 
 @njit(cache=True, error_model="numpy")
 def _follow(taps: Array, slope: Array, ahead: Array, ahead_T: float, dx: Array, z: Array) -> None:
-    """Add steps (N−1, n) of the unknowns, and one of T, to dx and z; the former are zero afterwards."""
+    """Add steps (N−1, W) of the unknowns, and one of T, to dx and z; the former are zero afterwards."""
     push_forward(taps, ahead, z)
     subtract(-ahead_T, slope, z)
     subtract(-1.0, ahead, dx)

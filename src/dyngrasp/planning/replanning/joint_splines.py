@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from dyngrasp.planning.replanning.lanes import LANES, lanes_of, load, store
 from dyngrasp.signals import Array
 
 Indices = NDArray[np.int64]
@@ -73,10 +74,8 @@ def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -
 
 
 @njit(cache=True, error_model="numpy")
-def boundary(
-    T: float, T_ref: float, ends: Array, reference: Motion, linear: bool, values: Array, slopes: Array
-) -> None:
-    """Write q, w, a at both ends and their derivatives by T, both (2, 3, n).
+def boundary(T: float, T_ref: float, ends: Array, reference: Array, linear: bool, values: Array, slopes: Array) -> None:
+    """Write q, w, a at both ends and their derivatives by T, both (2, 3, W), zero after the n joints.
 
     Exactly they are q, T q̇, T² q̈ of `ends` (2, 3, n). The paper's program knows them to first order about the
     reference: T* q̇ + q̇* (T − T*) and T*² q̈ + 2 T* v* (T − T*).
@@ -87,8 +86,8 @@ def boundary(
             q, rate, curvature = ends[end, 0, j], ends[end, 1, j], ends[end, 2, j]
             values[end, 0, j], slopes[end, 0, j] = q, 0.0
             if linear:
-                slopes[end, 1, j] = reference[1][k, j]
-                slopes[end, 2, j] = 2 * T_ref * reference[2][k, j]
+                slopes[end, 1, j] = reference[1, k, j]
+                slopes[end, 2, j] = 2 * T_ref * reference[2, k, j]
                 values[end, 1, j] = T_ref * rate + slopes[end, 1, j] * (T - T_ref)
                 values[end, 2, j] = T_ref * T_ref * curvature + slopes[end, 2, j] * (T - T_ref)
             else:
@@ -97,13 +96,24 @@ def boundary(
 
 
 @njit(cache=True, error_model="numpy")
+def unknowns_of(reference: Array, T: float, x: Array) -> None:
+    """Write the unknowns (N−1, W) of a motion q, q̇, q̈ (3, N+1, W): r = q − h² T² q̈ / 4."""
+    size, width = x.shape
+    factor = (T / (size + 1)) ** 2 / 4
+    inner, q, curvature = x[1 : size - 1].ravel(), reference[0, 2:size].ravel(), reference[2, 2:size].ravel()
+    for i in range(inner.size):
+        inner[i] = q[i] - factor * curvature[i]
+    for j in range(width):
+        x[0, j] = reference[0, 0, j] - factor * reference[2, 0, j]
+        x[size - 1, j] = reference[0, size + 1, j] - factor * reference[2, size + 1, j]
+
+
+@njit(cache=True, error_model="numpy")
 def sequence(x: Array, values: Array, held: tuple[bool, bool], r: Array) -> None:
     """Write r (N+3, n) from the unknowns x (N−1, n) and q, w, a at both ends (2, 3, n)."""
     size, n = x.shape
     h = 1.0 / (size + 1)
-    for i in range(1, size - 1):
-        for j in range(n):
-            r[i + 2, j] = x[i, j]
+    write(1.0, x[1 : size - 1], r[3 : size + 1])
     for end in range(2):
         at = 1 if end == 0 else size + 2
         for j in range(n):
@@ -128,7 +138,7 @@ def plain_taps(kind: int, K: int) -> tuple[float, float, float]:
 def filtered(r: Array, z: Array) -> None:
     """Write q, w, a (3, N+1, n) of a sequence r (N+3, n)."""
     K = z.shape[1]
-    first, second, third = neighbours(r, K)
+    first, second, third = r[:K].ravel(), r[1 : 1 + K].ravel(), r[2 : 2 + K].ravel()
     q, w, a = z[0].ravel(), z[1].ravel(), z[2].ravel()
     half_rate, curvature = 0.5 * (K - 1), float((K - 1) * (K - 1))
     for i in range(q.size):
@@ -139,78 +149,45 @@ def filtered(r: Array, z: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def neighbours(rows: Array, count: int) -> tuple[Array, Array, Array]:
-    """Views, flat, of `count` rows of an array (M, n) from the first, the second and the third on.
-
-    A loop over such views, all of them from zero, becomes vector instructions; nested ones of seven joints do not.
-    """
-    return rows[:count].ravel(), rows[1 : 1 + count].ravel(), rows[2 : 2 + count].ravel()
-
-
-@njit(cache=True, error_model="numpy")
-def pull_back(taps: Array, dual: Array, gradient: Array) -> None:
-    """Overwrite `gradient` (N−1, n) by the derivatives by x of Σ dual · z, `dual` (3, N+1, n)."""
-    gradient[:] = 0.0
-    for kind in range(3):
-        pull_back_one(kind, taps, dual[kind], gradient)
-
-
-@njit(cache=True, error_model="numpy")
-def pull_back_one(kind: int, taps: Array, dual: Array, gradient: Array) -> None:
-    """Add to `gradient` (N−1, n) the derivatives by x of Σ dual · z[kind], `dual` (N+1, n)."""
-    K, n = dual.shape
+def pull_back(kind: int, taps: Array, dual: Array, gradient: Array) -> None:
+    """Add to `gradient` (N−1, W) the derivatives by x of Σ dual · z[kind], `dual` (N+1, W)."""
+    K, width = dual.shape
     before, here, after = plain_taps(kind, K)
-    first, second, third = neighbours(dual[1:], K - 4)
-    out = gradient[1 : K - 3].ravel()
-    for i in range(out.size):
-        out[i] += after * first[i] + here * second[i] + before * third[i]
+    flat, out = dual.ravel(), gradient.ravel()
+    for j in range(0, width, LANES):
+        # What the interior unknowns do, then what the first and the last one do.
+        dual_0, dual_1 = load(flat, width + j, LANES), load(flat, 2 * width + j, LANES)
+        for i in range(1, K - 3):
+            at = i * width + j
+            dual_2 = load(flat, at + 2 * width, LANES)
+            store(load(out, at, LANES) + after * dual_0 + here * dual_1 + before * dual_2, out, at, LANES)
+            dual_0, dual_1 = dual_1, dual_2
     for k in range(TAPS):
-        for j in range(n):
+        for j in range(width):
             gradient[0, j] += taps[k, 0, kind] * dual[k, j]
             gradient[K - 3, j] += taps[K - TAPS + k, TAPS - 1, kind] * dual[K - TAPS + k, j]
 
 
 @njit(cache=True, error_model="numpy")
 def push_forward(taps: Array, dx: Array, z: Array) -> None:
-    """Add the change of q, w, a with dx (N−1, n) to z (3, N+1, n)."""
-    _, K, n = z.shape
+    """Add the change of q, w, a with dx (N−1, W) to z (3, N+1, W)."""
+    _, K, width = z.shape
+    flat = dx.ravel()
     for kind in range(3):
         before, here, after = plain_taps(kind, K)
-        inner = dx[1 : K - 3].ravel()
-        # What the interior unknowns do, then what the first and the last one do.
-        first, second, third = neighbours(z[kind, 1:], K - 4)
-        for i in range(inner.size):
-            first[i] += after * inner[i]
-        for i in range(inner.size):
-            second[i] += here * inner[i]
-        for i in range(inner.size):
-            third[i] += before * inner[i]
+        out = z[kind].ravel()
+        for j in range(0, width, LANES):
+            # What the interior unknowns do, then what the first and the last one do.
+            dx_2, dx_1 = lanes_of(0.0), lanes_of(0.0)
+            for k in range(1, K - 1):
+                at = k * width + j
+                dx_0 = load(flat, at, LANES) if k < K - 3 else lanes_of(0.0)
+                store(load(out, at, LANES) + after * dx_0 + here * dx_1 + before * dx_2, out, at, LANES)
+                dx_2, dx_1 = dx_1, dx_0
         for k in range(TAPS):
-            for j in range(n):
+            for j in range(width):
                 z[kind, k, j] += taps[k, 0, kind] * dx[0, j]
                 z[kind, K - TAPS + k, j] += taps[K - TAPS + k, TAPS - 1, kind] * dx[K - 3, j]
-
-
-@njit(cache=True, error_model="numpy")
-def spread_weights(kind: int, weights: Array, node_weights: Array, k_first: int, k_last: int, out: Array) -> None:
-    """Write the weights of q, w or a at all grid points (N+1, n), zero outside k_first … k_last − 1.
-
-    See `tracking_kernel.solve` for the weights.
-    """
-    for k in range(out.shape[0]):
-        weight = 0.0
-        if k_first <= k < k_last:
-            weight = weights[kind] + (node_weights[k] if kind == POSITION else 0.0)
-        for j in range(out.shape[1]):
-            out[k, j] = weight
-
-
-@njit(cache=True, error_model="numpy")
-def weigh(z: Array, weights: Array, node_weights: Array, k_first: int, k_last: int, dual: Array) -> None:
-    """Write Q z into `dual` (3, N+1, n)."""
-    for kind in range(3):
-        spread_weights(kind, weights, node_weights, k_first, k_last, dual[kind])
-        dual[kind] *= z[kind]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
@@ -223,93 +200,82 @@ def product(a: Array, b: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy")
+def spread_band(base: Array, band: Array) -> None:
+    """Write the bands (N−1, 3) of one matrix for every joint, (N−1, 3, W)."""
+    width = band.shape[2]
+    one, all_joints = base.ravel(), band.ravel()
+    for i in range(one.size):
+        for j in range(0, width, LANES):
+            store(lanes_of(one[i]), all_joints, i * width + j, LANES)
+
+
+@njit(cache=True, error_model="numpy")
 def factorise(band: Array) -> None:
-    """Replace bands (N−1, 3, n) of n pentadiagonal matrices by L and D⁻¹ of L D Lᵀ; joints lie side by side."""
-    size, _, n = band.shape
-    for i in range(size):
-        for j in range(n):
-            inverse = 1.0 / band[i, 0, j]
-            below, second = band[i, 1, j], band[i, 2, j]
+    """Replace bands (N−1, 3, W) of W pentadiagonal matrices by L and D⁻¹ of L D Lᵀ; joints lie side by side."""
+    size, _, width = band.shape
+    flat, zero = band.ravel(), lanes_of(0.0)
+    for j in range(0, width, LANES):
+        # What the last two columns leave of the diagonal, and the last one of the entry below it.
+        off_pivot, off_next_pivot, off_below = zero, zero, zero
+        for i in range(size):
+            at = 3 * i * width + j
+            inverse = 1.0 / (load(flat, at, LANES) - off_pivot)
+            below, second = load(flat, at + width, LANES) - off_below, load(flat, at + 2 * width, LANES)
             l1, l2 = below * inverse, second * inverse
-            band[i, 0, j], band[i, 1, j], band[i, 2, j] = inverse, l1, l2
-            if i + 1 < size:
-                band[i + 1, 0, j] -= l1 * below
-                band[i + 1, 1, j] -= l1 * second
-            if i + 2 < size:
-                band[i + 2, 0, j] -= l2 * second
+            store(inverse, flat, at, LANES)
+            store(l1, flat, at + width, LANES)
+            store(l2, flat, at + 2 * width, LANES)
+            off_pivot, off_next_pivot, off_below = off_next_pivot + l1 * below, l2 * second, l1 * second
 
 
 @njit(cache=True, error_model="numpy")
 def substitute(band: Array, x: Array) -> None:
-    """Overwrite the right-hand sides x (N−1, n) by the solutions."""
-    size, n = x.shape
-    for i in range(size - 1):
-        for j in range(n):
-            x[i + 1, j] -= band[i, 1, j] * x[i, j]
-        if i + 2 < size:
-            for j in range(n):
-                x[i + 2, j] -= band[i, 2, j] * x[i, j]
-    for i in range(size - 1, -1, -1):
-        for j in range(n):
-            x[i, j] *= band[i, 0, j]
-        if i + 1 < size:
-            for j in range(n):
-                x[i, j] -= band[i, 1, j] * x[i + 1, j]
-        if i + 2 < size:
-            for j in range(n):
-                x[i, j] -= band[i, 2, j] * x[i + 2, j]
+    """Overwrite the right-hand sides x (N−1, W) by the solutions."""
+    size, width = x.shape
+    L, b, zero = band.ravel(), x.ravel(), lanes_of(0.0)
+    for j in range(0, width, LANES):
+        x_2, x_1, l1, l2, next_l2 = zero, zero, zero, zero, zero
+        for i in range(size):
+            at, in_band = i * width + j, 3 * i * width + j
+            x_0 = load(b, at, LANES) - l2 * x_2 - l1 * x_1
+            store(x_0, b, at, LANES)
+            x_2, x_1 = x_1, x_0
+            l2, l1, next_l2 = next_l2, load(L, in_band + width, LANES), load(L, in_band + 2 * width, LANES)
+        x_2, x_1 = zero, zero
+        for i in range(size - 1, -1, -1):
+            at, in_band = i * width + j, 3 * i * width + j
+            inverse = load(L, in_band, LANES)
+            l1, l2 = load(L, in_band + width, LANES), load(L, in_band + 2 * width, LANES)
+            x_0 = load(b, at, LANES) * inverse - l2 * x_2 - l1 * x_1
+            store(x_0, b, at, LANES)
+            x_2, x_1 = x_1, x_0
 
 
 @njit(cache=True, error_model="numpy")
 def substitute_both(band: Array, x: Array, y: Array) -> None:
     """`substitute` for two right-hand sides; side by side they take little longer than one."""
-    size, n = x.shape
-    for i in range(size - 1):
-        for j in range(n):
-            x[i + 1, j] -= band[i, 1, j] * x[i, j]
-            y[i + 1, j] -= band[i, 1, j] * y[i, j]
-        if i + 2 < size:
-            for j in range(n):
-                x[i + 2, j] -= band[i, 2, j] * x[i, j]
-                y[i + 2, j] -= band[i, 2, j] * y[i, j]
-    for i in range(size - 1, -1, -1):
-        for j in range(n):
-            x[i, j] *= band[i, 0, j]
-            y[i, j] *= band[i, 0, j]
-        if i + 1 < size:
-            for j in range(n):
-                x[i, j] -= band[i, 1, j] * x[i + 1, j]
-                y[i, j] -= band[i, 1, j] * y[i + 1, j]
-        if i + 2 < size:
-            for j in range(n):
-                x[i, j] -= band[i, 2, j] * x[i + 2, j]
-                y[i, j] -= band[i, 2, j] * y[i + 2, j]
-
-
-@njit(cache=True, error_model="numpy")
-def substitute_shared(band: Array, x: Array) -> None:
-    """`substitute` where one band (N−1, 3) serves all columns of x (N−1, n)."""
-    size, n = x.shape
-    for i in range(size - 1):
-        l1 = band[i, 1]
-        for j in range(n):
-            x[i + 1, j] -= l1 * x[i, j]
-        if i + 2 < size:
-            l2 = band[i, 2]
-            for j in range(n):
-                x[i + 2, j] -= l2 * x[i, j]
-    for i in range(size - 1, -1, -1):
-        inverse = band[i, 0]
-        for j in range(n):
-            x[i, j] *= inverse
-        if i + 1 < size:
-            l1 = band[i, 1]
-            for j in range(n):
-                x[i, j] -= l1 * x[i + 1, j]
-        if i + 2 < size:
-            l2 = band[i, 2]
-            for j in range(n):
-                x[i, j] -= l2 * x[i + 2, j]
+    size, width = x.shape
+    L, b, c, zero = band.ravel(), x.ravel(), y.ravel(), lanes_of(0.0)
+    for j in range(0, width, LANES):
+        x_2, x_1, y_2, y_1, l1, l2, next_l2 = zero, zero, zero, zero, zero, zero, zero
+        for i in range(size):
+            at, in_band = i * width + j, 3 * i * width + j
+            x_0 = load(b, at, LANES) - l2 * x_2 - l1 * x_1
+            y_0 = load(c, at, LANES) - l2 * y_2 - l1 * y_1
+            store(x_0, b, at, LANES)
+            store(y_0, c, at, LANES)
+            x_2, x_1, y_2, y_1 = x_1, x_0, y_1, y_0
+            l2, l1, next_l2 = next_l2, load(L, in_band + width, LANES), load(L, in_band + 2 * width, LANES)
+        x_2, x_1, y_2, y_1 = zero, zero, zero, zero
+        for i in range(size - 1, -1, -1):
+            at, in_band = i * width + j, 3 * i * width + j
+            inverse = load(L, in_band, LANES)
+            l1, l2 = load(L, in_band + width, LANES), load(L, in_band + 2 * width, LANES)
+            x_0 = load(b, at, LANES) * inverse - l2 * x_2 - l1 * x_1
+            y_0 = load(c, at, LANES) * inverse - l2 * y_2 - l1 * y_1
+            store(x_0, b, at, LANES)
+            store(y_0, c, at, LANES)
+            x_2, x_1, y_2, y_1 = x_1, x_0, y_1, y_0
 
 
 @njit(cache=True, error_model="numpy")

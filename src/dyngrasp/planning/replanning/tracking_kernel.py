@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
-from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL
+from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     POSITION,
     RATE,
@@ -16,16 +16,18 @@ from dyngrasp.planning.replanning.joint_splines import (
     boundary,
     factorise,
     filtered,
-    neighbours,
     plain_taps,
     product,
-    pull_back_one,
-    push_forward,
+    pull_back,
     sequence,
-    spread_weights,
-    substitute_shared,
+    spread_band,
+    substitute,
+    substitute_both,
+    subtract,
+    unknowns_of,
+    write,
 )
-from dyngrasp.planning.replanning.joints_with_rows import solve_joints_with_rows
+from dyngrasp.planning.replanning.lanes import LANES, lanes_of, load, narrow, store, sum_of, whole_lanes, widen
 from dyngrasp.signals import Array
 
 # A row may be violated by this much of its half-width: a tenth of what the audit forgives as rounding.
@@ -53,7 +55,7 @@ def solve(
     T_ref: float,
     ends: Array,
     held: tuple[bool, bool],
-    weights: Array,
+    weights: tuple[float, float, float],
     node_weights: Array,
     duration_weight: float,
     ends_cost: bool,
@@ -64,7 +66,7 @@ def solve(
     taps: Array,
     bands: Array,
     max_iterations: int,
-    z: Array,
+    scaled_motion: Array,
     motion: Array,
 ) -> tuple[int, float, int, Indices, Array]:
     """Minimise ½ Σ_k Σ_j Q_q δq² + Q_q̇ δq̇² + Q_v δv² + ½ Σ_k Q_ΔT δT² between two boundary states, within boxes.
@@ -74,7 +76,7 @@ def solve(
         T_ref: ΔT* (s).
         ends: (2, 3, n) position, velocity, acceleration at both ends.
         held: Whether the acceleration is given at the start and at the end.
-        weights: (3,) Q_q, Q_q̇, Q_v.
+        weights: Q_q, Q_q̇, Q_v.
         node_weights: (K,) added to Q_q at each grid point.
         duration_weight: Q_ΔT of one grid point.
         ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
@@ -85,7 +87,7 @@ def solve(
         taps: Of `filters`.
         bands: Of `filters`.
         max_iterations: Of the interior point method.
-        z: (3, K, n), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
+        scaled_motion: (3, K, n), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
         motion: (3, K, n), overwritten by q, q̇, q̈, at both ends to the last digit those given; left as it is with
             `paper_rows`.
 
@@ -94,6 +96,11 @@ def solve(
         with those of the two bounds of T.
     """
     K, n = reference[0].shape
+    # Joints lie side by side in rows of whole lanes, W ≥ n numbers; what follows the joints is zero.
+    width = whole_lanes(n)
+    wanted, z = np.empty((3, K, width)), np.empty((3, K, width))
+    for kind in range(3):
+        widen(reference[kind], wanted[kind])
     boxes[:] = np.minimum(np.maximum(boxes, -UNBOUNDED), UNBOUNDED)
     size = K - 2
     free_T = duration[1] - duration[0] > 1e-12
@@ -118,19 +125,16 @@ def solve(
     if held[1]:
         base[size - 1, 0] = 1.0
     # All joints have the same weights, and until one of their rows is active the same matrix.
-    band = base.copy()
-    factorise(band.reshape(size, 3, 1))
+    band = np.empty((size, 3, width))
+    spread_band(base, band)
+    factorise(band)
 
-    x, r, r_by_T = np.empty((size, n)), np.empty((K + 2, n)), np.zeros((K + 2, n))
-    values, slopes, nothing = np.empty((2, 3, n)), np.empty((2, 3, n)), np.zeros((size, n))
-    h2 = 1.0 / (K - 1) ** 2
-    for i in range(size):
-        k = 0 if i == 0 else (K - 1 if i == size - 1 else i + 1)
-        for j in range(n):
-            x[i, j] = reference[0][k, j] - h2 / 4 * T_ref * T_ref * reference[2][k, j]
+    x, r, r_by_T = np.empty((size, width)), np.empty((K + 2, width)), np.zeros((K + 2, width))
+    values, slopes, nothing = np.zeros((2, 3, width)), np.zeros((2, 3, width)), np.zeros((size, width))
+    unknowns_of(wanted, T_ref, x)
 
-    dual, dual_by_T, weight = np.empty((K, n)), np.empty((K, n)), np.empty((K, n))
-    gradient, column, solved = np.empty((size, n)), np.empty((size, n)), np.zeros((size, n))
+    weight, dual, dual_by_T = np.zeros(K), np.empty((K, width)), np.empty((K, width))
+    gradient, column, solved = np.empty((size, width)), np.empty((size, width)), np.zeros((size, width))
     moving_ends = False
     for end in range(2):
         for j in range(n):
@@ -140,7 +144,7 @@ def solve(
     passes = 2 if moving_ends and free_T and not paper_rows else 1
     for _ in range(passes):
         T_lin = T
-        boundary(T, T_ref, ends, reference, paper_rows, values, slopes)
+        boundary(T, T_ref, ends, wanted, paper_rows, values, slopes)
         sequence(x, values, held, r)
         # The sequence is linear: at constant x it changes with T as it would from slopes at the ends and x = 0.
         sequence(nothing, slopes, held, r_by_T)
@@ -148,23 +152,26 @@ def solve(
         gradient[:], column[:] = 0.0, 0.0
         for kind in range(3):
             if scaled[kind] > 0.0 or (kind == POSITION and some_node):
-                spread_weights(kind, scaled, node_weights, k_first, k_last, weight)
-                by_T, by_TT = _duals(kind, weight, reference[kind], T, T_ref, r, r_by_T, dual, dual_by_T)
+                weight[k_first:k_last] = scaled[kind]
+                if kind == POSITION:
+                    weight[k_first:k_last] += node_weights[k_first:k_last]
+                by_T, by_TT = _duals(kind, weight, wanted[kind], T, T_ref, r, r_by_T, dual, dual_by_T)
                 g_T += by_T
                 corner += by_TT
-                pull_back_one(kind, taps, dual, gradient)
+                pull_back(kind, taps, dual, gradient)
                 if free_T:
-                    pull_back_one(kind, taps, dual_by_T, column)
-        substitute_shared(band, gradient)
+                    pull_back(kind, taps, dual_by_T, column)
         dT = 0.0
-        if free_T:
-            solved[:] = column
-            substitute_shared(band, solved)
+        if not free_T:
+            substitute(band, gradient)
+        else:
+            write(1.0, column, solved)
+            substitute_both(band, solved, gradient)
             dT = (product(column, gradient) - g_T) / (corner - product(column, solved))
             # For given T the rest follows: at a bound of T the program is solved by clipping, for it is convex.
             dT = min(max(dT, duration[0] - T), duration[1] - T)
-            gradient += dT * solved
-        x -= gradient
+            subtract(-dT, solved, gradient)
+        subtract(1.0, gradient, x)
         T += dT
         g_T += corner * dT - product(column, gradient)
     # The last step with the row of T² linear, as the program has it.
@@ -172,10 +179,10 @@ def solve(
     sequence(x, values, held, r)
     filtered(r, z)
 
-    rates = np.empty((2, K if paper_rows else 0, n))
+    rates = np.empty((2, K if paper_rows else 0, width))
     if paper_rows:
-        rates[0] = reference[1]
-        rates[1] = 2 * T_ref * reference[2]
+        write(1.0, wanted[1], rates[0])
+        write(2 * T_ref, wanted[2], rates[1])
         T_lin = T_ref
     a_ends = (not held[0], not held[1])
     iterations, outcome, count = 0, OPTIMAL, 0
@@ -187,43 +194,18 @@ def solve(
         count = near
         slope = np.empty_like(z)
         filtered(r_by_T, slope)
-        # Where no row is in the way, T takes everything along with it.
-        along_T, along_T_z = -solved, slope.copy()
-        push_forward(taps, along_T, along_T_z)
         # The cost of moving by what is violated is the scale of a program whose free optimum costs next to nothing.
-        cost = _cost(reference, T, T_ref, z, scaled, node_weights, k_first, k_last)
+        cost = _cost(wanted, T, T_ref, z, scaled, node_weights, k_first, k_last)
         cost += 0.5 * stiffness_T * (T - T_ref) ** 2
         violation = -least
         unit = max(cost, 0.5 * (stiffness_T + n * scaled[0]) * violation**2, 1e-9)
         x_free, z_free, T_free = x.copy(), z.copy(), T
         for attempt in range(3):
             x[:], z[:], T = x_free, z_free, T_free
-            outcome, T, steps, count = solve_joints_with_rows(
-                codes,
-                count,
-                a_ends,
-                first,
-                taps,
-                base,
-                column,
-                along_T,
-                corner,
-                g_T,
-                slope,
-                along_T_z,
-                x,
-                T,
-                T_lin,
-                z,
-                boxes,
-                rates,
-                duration,
-                free_T,
-                unit,
-                violation,
-                max_iterations,
-                multipliers,
-            )
+            outcome, T, steps, count = interior_point(
+                codes, count, a_ends, first, taps, base, column, corner, g_T, slope, x, T, T_lin, z, boxes, rates,
+                duration, free_T, unit, violation, max_iterations, multipliers,
+            )  # fmt: skip
             iterations += steps
             if outcome != OPTIMAL:
                 break
@@ -240,10 +222,12 @@ def solve(
         if outcome == OPTIMAL and least < -VIOLATION:
             outcome = INFEASIBLE
     if not paper_rows:
-        boundary(T, T_ref, ends, reference, False, values, slopes)
+        boundary(T, T_ref, ends, wanted, False, values, slopes)
         sequence(x, values, held, r)
         filtered(r, z)
         _in_real_time(z, T, ends, held, motion)
+    for kind in range(3):
+        narrow(1.0, z[kind], scaled_motion[kind])
     if outcome == OPTIMAL and not (0.0 < T < np.inf and product(z, z) < np.inf):
         outcome = NONFINITE
     return outcome, T, iterations, codes[:count].copy(), multipliers[: count + 2].copy()
@@ -257,7 +241,7 @@ def _of_reference(kind: int, T: float, T_ref: float) -> tuple[float, float]:
     return (T, 1.0) if kind == RATE else (T_ref * (2 * T - T_ref), 2 * T_ref)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@njit(cache=True, error_model="numpy")
 def _duals(
     kind: int,
     weight: Array,
@@ -269,32 +253,42 @@ def _duals(
     dual: Array,
     dual_by_T: Array,
 ) -> tuple[float, float]:
-    """Write the weighted deviations of q, w or a (N+1, n) and their derivatives by T; return those of the cost by T."""
-    K, _ = reference.shape
+    """Write the weighted deviations of q, w or a (N+1, W) and their derivatives by T; return those of the cost by T.
+
+    The weights (N+1,) are those of the grid points.
+    """
+    K, width = reference.shape
     before, here, after = plain_taps(kind, K)
     factor, factor_by_T = _of_reference(kind, T, T_ref)
-    wanted, weights, out, out_by_T = reference.ravel(), weight.ravel(), dual.ravel(), dual_by_T.ravel()
-    r_0, r_1, r_2 = neighbours(r, K)
-    d_0, d_1, d_2 = neighbours(r_by_T, K)
-    by_T, by_TT = 0.0, 0.0
-    for i in range(wanted.size):
-        value = before * r_0[i] + here * r_1[i] + after * r_2[i] - factor * wanted[i]
-        slope = before * d_0[i] + here * d_1[i] + after * d_2[i] - factor_by_T * wanted[i]
-        out[i], out_by_T[i] = weights[i] * value, weights[i] * slope
-        by_T += weights[i] * value * slope
-        by_TT += weights[i] * slope * slope
-    return by_T, by_TT
+    wanted, rows, rows_by_T = reference.ravel(), r.ravel(), r_by_T.ravel()
+    out, out_by_T = dual.ravel(), dual_by_T.ravel()
+    by_T, by_TT = lanes_of(0.0), lanes_of(0.0)
+    for j in range(0, width, LANES):
+        r_0, r_1 = load(rows, j, LANES), load(rows, j + width, LANES)
+        d_0, d_1 = load(rows_by_T, j, LANES), load(rows_by_T, j + width, LANES)
+        for k in range(K):
+            at = k * width + j
+            r_2, d_2 = load(rows, at + 2 * width, LANES), load(rows_by_T, at + 2 * width, LANES)
+            target = load(wanted, at, LANES)
+            value = before * r_0 + here * r_1 + after * r_2 - factor * target
+            slope = before * d_0 + here * d_1 + after * d_2 - factor_by_T * target
+            weighted, weighted_by_T = weight[k] * value, weight[k] * slope
+            store(weighted, out, at, LANES)
+            store(weighted_by_T, out_by_T, at, LANES)
+            by_T, by_TT = by_T + weighted * slope, by_TT + weighted_by_T * slope
+            r_0, r_1, d_0, d_1 = r_1, r_2, d_1, d_2
+    return sum_of(by_T), sum_of(by_TT)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 def _cost(
-    reference: Motion, T: float, T_ref: float, z: Array, scaled: Array, node_weights: Array, k_first: int, k_last: int
+    reference: Array, T: float, T_ref: float, z: Array, scaled: Array, node_weights: Array, k_first: int, k_last: int
 ) -> float:
-    """What the deviations of q, w, a (3, N+1, n) cost."""
+    """What the deviations of q, w, a (3, N+1, W) from the reference cost."""
     total, inside = 0.0, slice(k_first, k_last)
     for kind in range(3):
         factor, _ = _of_reference(kind, T, T_ref)
-        reached, wanted = z[kind, inside].ravel(), reference[kind][inside].ravel()
+        reached, wanted = z[kind, inside].ravel(), reference[kind, inside].ravel()
         squares = 0.0
         for i in range(reached.size):
             squares += (reached[i] - factor * wanted[i]) ** 2
@@ -302,17 +296,15 @@ def _cost(
     for k in range(k_first, k_last):
         if node_weights[k] > 0.0:
             for j in range(z.shape[2]):
-                total += node_weights[k] * (z[0, k, j] - reference[0][k, j]) ** 2
+                total += node_weights[k] * (z[0, k, j] - reference[0, k, j]) ** 2
     return 0.5 * total
 
 
 @njit(cache=True, error_model="numpy")
 def _in_real_time(z: Array, T: float, ends: Array, held: tuple[bool, bool], motion: Array) -> None:
-    """Write q, q̇, q̈ (3, N+1, n) of q, w, a, and into their ends what was given there."""
+    """Write q, q̇, q̈ (3, N+1, n) of q, w, a (3, N+1, W), and into their ends what was given there."""
     for kind in range(3):
-        factor, scaled, out = T**-kind, z[kind].ravel(), motion[kind].ravel()
-        for i in range(out.size):
-            out[i] = factor * scaled[i]
+        narrow(T**-kind, z[kind], motion[kind])
         for end in range(2):
             if kind < 2 or held[end]:
                 motion[kind, -end] = ends[end, kind]

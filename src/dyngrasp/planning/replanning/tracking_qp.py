@@ -150,7 +150,6 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
     ends[0], ends[1] = problem.start, problem.end
     held = (problem.hold_start_acceleration, problem.hold_end_acceleration)
     w = problem.weights
-    weights = np.array([w.position, w.velocity, w.acceleration])
     boxes = np.empty((4, n))
     boxes[0], boxes[1] = problem.position_lower, problem.position_upper
     boxes[2], boxes[3] = problem.velocity_limit, problem.acceleration_limit
@@ -161,7 +160,7 @@ def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> Tracki
         reference.duration,
         ends,
         held,
-        weights,
+        (float(w.position), float(w.velocity), float(w.acceleration)),
         np.zeros(N + 1) if problem.node_weights is None else problem.node_weights,
         w.duration,
         not problem.paper_rows,
