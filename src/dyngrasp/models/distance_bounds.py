@@ -159,8 +159,8 @@ def add_pieces_near_ground(motion, pieces, start, horizon, found, n):
 def add_near_pieces(motion, bodies, pieces, windows, horizon, found, n):
     """Add bodies that may come nearer than `horizon` (m) to pieces.
 
-    Bounds are gaps between boxes along the axes of the part: first a link as a whole against all pieces, then a body
-    against all, then against each; what is far at one of these steps until some sample is not looked at before it.
+    Bounds are gaps between boxes along the axes of the part: first a link as a whole against all pieces, then a capsule
+    around a body against all, then the body against each; what is far at one of these steps until some sample is not looked at before it.
     Other arguments and the answer are those of `add_near_ground`.
 
     Args:
@@ -196,16 +196,16 @@ def add_near_pieces(motion, bodies, pieces, windows, horizon, found, n):
             first, last = max(begin, windows[b, 0]), windows[b, 1]
             if first >= last:
                 continue
-            # Against so many pieces nearly every sample is looked at.
-            span(R[k], p[k], bodies.ends[b], bodies.halves[b], own_low, own_high, first, last)
             write_path(shift[k], turn[k], bodies.reaches[b], path)
             while first < last:
-                bound = gap(own_low, own_high, first, pieces.around[0], pieces.around[1]) - bodies.rounding[b]
+                bound = segment_gap(R[k], p[k], bodies.ends[b], first, pieces.around) - bodies.radii[b]
                 if bound < horizon:
                     break
                 first = next_beyond(path, first, last, bound - horizon)
             if first >= last:
                 continue
+            # Against so many pieces nearly every sample is looked at.
+            span(R[k], p[k], bodies.ends[b], bodies.halves[b], own_low, own_high, first, last)
             for i in range(pieces.reaches.size):
                 if _is_full(found, n, e, samples):
                     return -1

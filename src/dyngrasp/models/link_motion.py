@@ -114,7 +114,9 @@ def next_beyond(path, s, stop, room):
     While a body stays where it is, so does its distance: without room it must move for the next one to count.
     """
     allowed = path[s] + max(room, STILL)
-    low, high = s + 1, stop
+    if path[stop - 1] <= allowed:
+        return stop
+    low, high = s + 1, stop - 1
     while low < high:
         middle = (low + high) // 2
         if path[middle] <= allowed:
@@ -132,14 +134,11 @@ def span(R, p, ends, halves, low, high, first, last):
     """
     x, y, z = (ends[0, 0] + ends[1, 0]) / 2, (ends[0, 1] + ends[1, 1]) / 2, (ends[0, 2] + ends[1, 2]) / 2
     for a in range(3):
-        for s in range(first, last):
-            middle = p[a, s] + R[a, 0, s] * x + R[a, 1, s] * y + R[a, 2, s] * z
-            low[a, s] = high[a, s] = middle
-        for c in range(3):
-            u, v, w = halves[c, 0], halves[c, 1], halves[c, 2]
-            if u == 0.0 and v == 0.0 and w == 0.0:
-                continue
-            for s in range(first, last):
-                extent = abs(R[a, 0, s] * u + R[a, 1, s] * v + R[a, 2, s] * w)
-                low[a, s] -= extent
-                high[a, s] += extent
+        X, Y, Z, origin = R[a, 0, first:last], R[a, 1, first:last], R[a, 2, first:last], p[a, first:last]
+        lowest, highest = low[a, first:last], high[a, first:last]
+        for s in range(origin.size):
+            extent = 0.0
+            for c in range(3):
+                extent += abs(X[s] * halves[c, 0] + Y[s] * halves[c, 1] + Z[s] * halves[c, 2])
+            middle = origin[s] + X[s] * x + Y[s] * y + Z[s] * z
+            lowest[s], highest[s] = middle - extent, middle + extent
