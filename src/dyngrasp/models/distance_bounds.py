@@ -160,8 +160,8 @@ def add_near_pieces(motion, bodies, pieces, windows, horizon, found, n):
     """Add bodies that may come nearer than `horizon` (m) to pieces.
 
     Bounds are gaps between boxes along the axes of the part: first a link as a whole against all pieces, then a capsule
-    around a body against all, then the body against each; what is far at one of these steps until some sample is not looked at before it.
-    Other arguments and the answer are those of `add_near_ground`.
+    around a body against all, then the body against each; what is far at one of these steps until some sample is not
+    looked at before it. Other arguments and the answer are those of `add_near_ground`.
 
     Args:
         motion: `Motion` as seen from the part.
