@@ -57,7 +57,8 @@ def test_names_a_missing_entry_of_the_header(delivered, tmp_path):
         entries = dict(archive)
     header = json.loads(str(entries["header"]))
     del header["arm_joints"]
-    np.savez(path, **(entries | {"header": np.array(json.dumps(header))}))
+    entries["header"] = np.array(json.dumps(header))
+    np.savez(path, **entries)  # pyright: ignore[reportArgumentType]  # none of them is called allow_pickle
     with pytest.raises(InputFileError, match="arm_joints"):
         EpisodeRecord.load(path)
 
