@@ -113,10 +113,6 @@ class BatchModel:
         """Poses of K frames in the world: rotations (K, 3, 3, M), positions (K, 3, M) for q (n, M)."""
         return frame_poses(q, self.tree, frames.arrays)
 
-    def link_poses(self, q: Array, R: Array, p: Array) -> None:
-        """Write the poses of all turned joint frames in the world into R (n, 3, 3, M) and p (n, 3, M), for q (n, M)."""
-        link_poses(q, self.tree, R, p)
-
     def inverse_dynamics(self, q: Array, w: Array, v: Array) -> tuple[Array, Array]:
         """Recursive Newton-Euler for a chain (each joint on the link before it); q, w, v (n, M).
 
@@ -201,7 +197,7 @@ def side_by_side(q, q_h, arm_indices, hand_indices):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def link_poses(q, tree, R, p):
-    """`BatchModel.link_poses` for its `tree`."""
+    """Write the poses of all turned joint frames at q (n, M) of a `tree`: R (n, 3, 3, M), p (n, 3, M) in the world."""
     (cosine, sine), (parents, rotations, offsets) = cosine_sine(q), tree
     n, samples = q.shape
     for i in range(n):

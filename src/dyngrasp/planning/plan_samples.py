@@ -63,6 +63,7 @@ def waypoints_of(plan: GraspPlan, since: float = -np.inf) -> Waypoints:
 
 @njit(cache=True, error_model="numpy")
 def _on_grids(arm, gripper, ends, since):
+    """The attributes of `at_grid_points`."""
     most = 0
     for i in range(3):
         most += max(arm[i][1].shape[0], gripper[i][1].shape[0]) + 1
@@ -88,6 +89,7 @@ def _on_grids(arm, gripper, ends, since):
 
 @njit(cache=True, error_model="numpy")
 def _inside(arm, gripper, ends, times, grid_stops, suspects):
+    """The attributes of `between`."""
     local, stops = np.empty(SUBSTEPS * suspects.sum()), np.zeros(3, np.int64)
     count = start = 0
     for i in range(3):
@@ -97,13 +99,13 @@ def _inside(arm, gripper, ends, times, grid_stops, suspects):
                 for part in range(1, SUBSTEPS):
                     local[count] = times[k] - begin + part / SUBSTEPS * (times[k + 1] - times[k])
                     count += 1
-        start = stops[i] = grid_stops[i]
-        stops[i] = count
+        start, stops[i] = grid_stops[i], count
     return _states(arm, gripper, ends, local[:count], stops)
 
 
 @njit(cache=True, error_model="numpy")
 def _along_paths(arm, gripper, ends, since):
+    """The attributes of `waypoints_of`."""
     local, stops = np.empty(0), np.zeros(3, np.int64)
     for i in range(3):
         if since < ends[i]:

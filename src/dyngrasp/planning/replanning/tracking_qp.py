@@ -123,7 +123,7 @@ class TrackingSolution:
         """The motion in real time, its boundary states those of the problem to the last digit."""
         if problem.paper_rows:
             return paper_update(problem.reference, paper_step(problem, self))
-        return Trajectory(self.duration, *self.motion)
+        return Trajectory.of(self.duration, self.motion)
 
 
 _STATUS = {
@@ -132,8 +132,6 @@ _STATUS = {
     ITERATION_LIMIT: Status.ITERATION_LIMIT,
     NONFINITE: Status.NONFINITE,
 }
-
-_DURATION_SLACK = 1e-12  # an interval of durations narrower than this is a point
 
 
 def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> TrackingSolution:
