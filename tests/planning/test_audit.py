@@ -183,3 +183,11 @@ def test_a_plan_that_stops_on_its_way_is_told_from_one_that_does_not(plan, task)
     assert found.time == pytest.approx(plan.start_time + 0.25 * arm.duration, abs=arm.duration / arm.intervals)
     # What is past does not count.
     assert standstill(replace(plan, arm=(stopping, *plan.arm[1:])), task, plan.start_time + 0.5 * arm.duration).ok
+
+
+def test_a_velocity_that_is_no_number_is_no_motion(plan, task):
+    broken, velocity = copy.copy(plan.arm[1]), plan.arm[1].velocity.copy()
+    velocity[40, 1] = np.nan
+    velocity.setflags(write=False)
+    object.__setattr__(broken, "velocity", velocity)
+    assert not standstill(unchecked(plan, arm=(plan.arm[0], broken, plan.arm[2])), task).ok

@@ -11,6 +11,8 @@ import pytest
 import trimesh
 
 from dyngrasp.models.assembly import assemble
+from dyngrasp.models.distance_bounds import add_near_pieces, first_of, space_for
+from dyngrasp.planning import clearance
 from dyngrasp.planning.cell_geometry import cell_geometry
 from dyngrasp.planning.clearance import HORIZON, RESOLUTION, clearance_entries
 from dyngrasp.planning.part_motion import part_motion
@@ -109,6 +111,26 @@ def test_the_same_as_measuring_everything(task, targets, plan, aside):
         # Both stop within Coal's tolerance; how deep bodies are in each other, its expanding polytope finds less well.
         tolerance = 2 * RESOLUTION if distance > 0 else 2 * RESOLUTION + 1e-4
         assert found[name].worst == pytest.approx(distance, abs=tolerance), name
+
+
+def test_more_pairs_than_there_was_room_for_at_first(task, targets, plan):
+    """The hand in the part and in the ground: more candidates than most plans have, and none of them lost."""
+    waypoints = waypoints_of(plan)
+    low = replace(waypoints, q=waypoints.q + np.eye(task.robot.n)[:, [1]] * 0.15)
+    cell = cell_geometry(task, targets.grasp.name)
+    found, expected = {}, {}
+    for name, samples in (("usual", waypoints), ("low", low)):
+        _, seen, _ = cell.motions(samples, part_motion(targets))
+        every = np.tile([0, samples.times.size], (cell.bodies.radii.size, 1))
+        pairs, _ = clearance._candidates_at_part(seen, cell.bodies, cell.pieces, every, HORIZON)
+        pairs_at_most = cell.bodies.radii.size * cell.pieces.reaches.size
+        most = space_for(pairs_at_most, pairs_at_most * samples.times.size)
+        count = add_near_pieces(seen, cell.bodies, cell.pieces, every, HORIZON, most, 0)
+        found[name], expected[name] = pairs, first_of(most, count)
+    assert len(found["low"].pairs) > clearance._FEW
+    for name in found:
+        for one, other in zip(found[name], expected[name], strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_entry_says_where_and_who(task, targets, plan):

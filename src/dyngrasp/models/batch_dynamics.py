@@ -256,7 +256,12 @@ def newton_euler(q, w, v, chain):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def link_wrenches(q, w, v, chain):
-    """Way out of the recursion: what moves each link by itself, (n, 6, M), and the motion (9, M) of the last one."""
+    """Way out of the recursion, for q, q̇, q̈ (n, M) and the arrays of a `chain`.
+
+    Returns:
+        Force and moment (N, Nm) that move each link by itself, (n, 6, M), and the motion (9, M) of the last one, as of
+        `BatchModel.inverse_dynamics`.
+    """
     rotations, offsets, mass, first_moment, inertia, _, gravity = chain
     (n, samples), (cosine, sine) = q.shape, cosine_sine(q)
     wrenches = np.empty((n, 6, samples))
@@ -273,7 +278,7 @@ def link_wrenches(q, w, v, chain):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def joint_torques(q, v, wrenches, chain):
-    """Way back of the recursion: torques (n, M) for wrenches on the links (n, 6, M), which are overwritten by sums."""
+    """Way back of the recursion: torques (n, M) (Nm) for the wrenches of `link_wrenches`, overwritten by their sums."""
     rotations, offsets, _, _, _, armature, _ = chain
     (n, samples), (cosine, sine), torque = q.shape, cosine_sine(q), np.empty(q.shape)
     for i in range(n - 1, -1, -1):

@@ -117,6 +117,9 @@ def _slowest(arm, ends, limit, since, at_ends):
                 w = velocity[k, j]
                 if half % 2:
                     w = (w + velocity[k + 1, j]) / 2 - step / 8 * (acceleration[k + 1, j] - acceleration[k, j])
+                if w != w:
+                    # A velocity that is no number is no motion.
+                    return w, t
                 speed = max(speed, abs(w) / limit[j])
                 # One fast joint is enough.
                 if speed >= least:
