@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import replace
 
@@ -263,6 +264,25 @@ def test_nearest_returns_a_reference_that_reaches_the_pose() -> None:
         assert np.abs(ARM.nearest(ROBOT.forward_kinematics(q), q) - q).max() < 1e-9
 
 
+def test_follow_keeps_arm_angle_and_branch_and_says_where_it_cannot() -> None:
+    random = np.random.default_rng(12)
+    references = random.uniform(LOWER, UPPER, (400, 7))
+    moves = [pin.exp6(random.normal(size=6) * size) for size in np.repeat([0.01, 0.3], 200)]
+    poses = [ARM.forward_kinematics(q) * move for q, move in zip(references, moves, strict=True)]
+    found, turn = ARM.follow(np.array([T.homogeneous[:3] for T in poses]), references)
+    wanted = np.full((400, 7), np.nan)
+    for k, (T, q) in enumerate(zip(poses, references, strict=True)):
+        with contextlib.suppress(OutOfReach):
+            wanted[k] = ARM.solve(T, ARM.arm_angle(q), ARM.branch(q))
+    refused = np.isnan(wanted).any(axis=1)
+    assert 20 < refused.sum() < 380
+    # the same closed form, so to the last bits of an angle
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12)
+    assert math.isnan(turn)
+    near = np.array([T.homogeneous[:3] for T in poses])[~refused]
+    assert ARM.follow(near, references[~refused])[1] == np.abs(found - references)[~refused].max()
+
+
 def test_null_space_rate_turns_the_elbow_at_unit_rate_and_holds_the_flange() -> None:
     h, checked = 1e-6, 0
     for q in random_postures(300, seed=9):
@@ -301,6 +321,8 @@ def test_bad_input_is_refused() -> None:
         ARM.solutions(pin.SE3(np.eye(3), np.array([np.nan, 0.0, 0.0])))
     with pytest.raises(InvalidProblem, match="q_reference"):
         ARM.nearest(T, np.full(7, np.inf))
+    with pytest.raises(InvalidProblem, match=r"\(K, 7\)"):
+        ARM.follow(T.homogeneous[None, :3], np.zeros((2, 7)))
     with pytest.raises(InvalidProblem, match="positive"):
         SrsKinematics(np.array([0.36, 0.0, 0.4, 0.126]), ROBOT.limits)
     with pytest.raises(InvalidProblem, match="lengths"):

@@ -19,7 +19,7 @@ from dyngrasp.models.srs_chain import BRANCHES, ElbowCircle, SrsChain, joint_vec
 from dyngrasp.models.srs_search import (
     admissible_configurations,
     configurations_on,
-    follow_configuration,
+    follow_configurations,
     nearest_configuration,
 )
 from dyngrasp.signals import Array, frozen, read_only
@@ -163,20 +163,30 @@ class SrsKinematics:
             )
         return q
 
-    def follow(self, T_world_flange: pin.SE3, q_reference: ArrayLike) -> Array:
-        """The configuration (7,) with the arm angle and the branch of another one (7,) (rad).
+    def follow(self, poses: Array, q_references: Array) -> tuple[Array, float]:
+        """The configurations with the arm angles and the branches of other ones.
+
+        Args:
+            poses: (K, 3, 4) poses [R | p] of the flange.
+            q_references: (K, 7) configurations (rad), one for each of them.
+
+        Returns:
+            Configurations (K, 7) within the limits (rad), NaN where there is none, and the largest turn of a joint from
+            the references to them, NaN if one of them is.
 
         Raises:
-            OutOfReach, InvalidProblem: As `solve`.
+            InvalidProblem: Other shapes.
         """
-        q_reference, q = joint_vector(q_reference), np.empty(7)
-        limits = self.limits
-        if follow_configuration(
-            T_world_flange.rotation, T_world_flange.translation, q_reference, self._chain.lengths, *self._reach,
-            self._middle, limits.position_lower, limits.position_upper, q,
-        ):  # fmt: skip
-            return q
-        return self.solve(T_world_flange, self.arm_angle(q_reference), self.branch(q_reference))
+        if poses.shape[1:] != (3, 4) or q_references.shape != (len(poses), 7):
+            raise InvalidProblem(
+                f"poses (K, 3, 4) and configurations (K, 7) expected, got {poses.shape} and {q_references.shape}"
+            )
+        q, limits = np.empty((len(poses), 7)), self.limits
+        turn = follow_configurations(
+            poses, q_references, self.lengths, *self._reach, self._middle, limits.position_lower,
+            limits.position_upper, q,
+        )  # fmt: skip
+        return q, turn
 
     def scan(self, T_world_flange: pin.SE3, arm_angles: int | ArrayLike = ARM_ANGLES) -> SrsSolutions:
         """All configurations within the limits, over a grid of arm angles and all branches.

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.models.srs_chain import ALIGNED, BRANCHES, ROUNDING, angles_at, arm_angle_of, circle_at, put_on_branch
+from dyngrasp.trajectory import largest_difference
 
 _REFINED = 4  # local minima on the grid of arm angles that are looked into
 _FOUND = 1e-9  # how near to a minimum its search ends (rad)
@@ -60,9 +61,18 @@ def nearest_configuration(elbow, rotations, grid, step, reference, weight, middl
 
 
 @njit(cache=True, error_model="numpy")
-def follow_configuration(R, p, q_reference, lengths, nearest, farthest, middle, lower, upper, out):
-    """Write `SrsKinematics.follow`; whether there is such a configuration."""
-    elbow, rotations, L = circle_at(R, p, lengths, nearest, farthest)
+def follow_configurations(poses, references, lengths, nearest, farthest, middle, lower, upper, out):
+    """`SrsKinematics.follow`: write the configurations (K, 7), return the largest turn of a joint."""
+    for k in range(len(poses)):
+        if not _follow(poses[k], references[k], lengths, nearest, farthest, middle, lower, upper, out[k]):
+            out[k] = np.nan
+    return largest_difference(out.ravel(), references.ravel())
+
+
+@njit(cache=True, error_model="numpy")
+def _follow(pose, q_reference, lengths, nearest, farthest, middle, lower, upper, out):
+    """Write the configuration (7,) of one pose [R | p]; whether there is one."""
+    elbow, rotations, L = circle_at(pose[:, :3], pose[:, 3], lengths, nearest, farthest)
     if not (L >= ALIGNED and nearest - ROUNDING <= L <= farthest + ROUNDING):
         return False
     angles, psi = np.empty(7), arm_angle_of(q_reference, lengths[1], lengths[2])

@@ -1,5 +1,7 @@
 """Updated targets against forward kinematics, and that the posture follows the part without a jump."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -92,3 +94,46 @@ def test_hand_moves_with_a_moving_part_and_lifts(task, targets):
 def test_out_of_reach_is_refused(task, targets):
     with pytest.raises(OutOfReach):
         updated_targets(targets, displaced(targets.T_world_object, 1.0, 0.0, 0.0), task)
+
+
+def test_where_the_arm_angle_of_the_plan_is_forbidden_the_nearest_of_the_branch_is_taken(task, targets):
+    kinematics = SrsKinematics.from_robot(task.robot)
+    updater, like = TargetUpdater(task), targets.grasped.position
+    pose, branch, angle = task.robot.forward_kinematics(like), kinematics.branch(like), kinematics.arm_angle(like)
+    turned = 0
+    for turn in np.deg2rad(np.arange(5.0, 120.0, 5.0)):
+        T = pose * pin.SE3(pin.utils.rotate("z", turn), np.zeros(3))
+        both = np.array([pose.homogeneous[:3], T.homogeneous[:3]])
+        try:
+            found = updater.postures(both, np.array([like, like]))
+        except OutOfReach:
+            continue
+        np.testing.assert_allclose(found[0], like, rtol=0.0, atol=1e-9)
+        assert np.abs(pin.log6(T.actInv(task.robot.forward_kinematics(found[1]))).vector).max() < 1e-9
+        assert kinematics.branch(found[1]) == branch
+        steps = np.rint(np.rad2deg(kinematics.arm_angle(found[1]) - angle) / 2.0)
+        assert abs(kinematics.arm_angle(found[1]) - angle - np.deg2rad(2.0 * steps)) < 1e-9
+        for step in np.arange(-abs(steps) + 1, abs(steps)):
+            with pytest.raises(OutOfReach):
+                kinematics.solve(T, angle + np.deg2rad(2.0 * step), branch)
+        turned += steps != 0
+    assert turned > 0
+    flipped = pose * pin.SE3(pin.utils.rotate("z", np.pi), np.zeros(3))
+    with pytest.raises(OutOfReach, match=r"no arm angle|turn by"):
+        updater.postures(flipped.homogeneous[None, :3], like[None])
+
+
+@settings(max_examples=10)
+@given(**MOVES)
+def test_an_arm_without_a_closed_form_follows_too(task, targets, x, y, turn):
+    general = replace(task, robot=replace(task.robot, kinematics="general", srs=None))
+    T, twist, duration = displaced(targets.T_world_object, x, y, turn), np.array([0.0, 0.04, 0.0, 0.0, 0.0, 0.1]), 0.6
+    new = TargetUpdater(general).update(targets, T, twist, 3.0, duration)
+    exact = TargetUpdater(task).update(targets, T, twist, 3.0, duration)
+    robot = task.robot
+    for state, other in ((new.grasped, exact.grasped), (new.pregrasp, exact.pregrasp)):
+        between = robot.forward_kinematics(other.position).actInv(robot.forward_kinematics(state.position))
+        # tolerance of the numerical solution: 1e-10 m and rad
+        assert np.abs(pin.log6(between).vector).max() < 1e-9
+        velocities = robot.jacobian(state.position) @ state.velocity, robot.jacobian(other.position) @ other.velocity
+        assert np.abs(velocities[0] - velocities[1]).max() < 1e-8

@@ -123,29 +123,45 @@ class TargetUpdater:
         return self._flanges[key]
 
     def posture(self, T_world_flange: pin.SE3, q_previous: Array) -> Array:
-        """The configuration (n,) of the branch, and if the limits allow of the arm angle, of a previous one (n,) (rad).
+        """`postures` of one pose."""
+        return self.postures(T_world_flange.homogeneous[None, :3], q_previous[None])[0]
+
+    def postures(self, poses: Array, like: Array) -> Array:
+        """Configurations of the branches, and if the limits allow of the arm angles, of previous ones.
+
+        Args:
+            poses: (K, 3, 4) poses [R | p] of the flange.
+            like: (K, n) previous configuration for each of them (rad).
+
+        Returns:
+            (K, n) rad.
 
         Raises:
-            OutOfReach: There is none near.
+            OutOfReach: There is none near one of them.
         """
-        kinematics = self._kinematics
-        if not isinstance(kinematics, SrsKinematics):
-            q = kinematics.nearest(T_world_flange, q_previous)
+        if isinstance(self._kinematics, SrsKinematics):
+            q, turn = self._kinematics.follow(poses, like)
+            if turn <= _LARGEST_TURN:
+                return q
         else:
-            try:
-                q = kinematics.follow(T_world_flange, q_previous)
-            except OutOfReach:
-                branch, angle = kinematics.branch(q_previous), kinematics.arm_angle(q_previous)
-                q = self._nearest_arm_angle(T_world_flange, angle, branch)
-        turn = largest_difference(q, q_previous)
-        if turn > _LARGEST_TURN:
-            raise OutOfReach("the new pose", 0.0, f"a joint would have to turn by {np.rad2deg(turn):.0f}° to follow it")
+            q = np.full(like.shape, np.nan)
+        for k, pose in enumerate(poses):
+            if np.isnan(q[k]).any():
+                q[k] = self._nearest(pin.SE3(pose[:, :3], pose[:, 3]), like[k])
+            turn = largest_difference(q[k], like[k])
+            if turn > _LARGEST_TURN:
+                reason = f"a joint would have to turn by {np.rad2deg(turn):.0f}° to follow it"
+                raise OutOfReach("the new pose", 0.0, reason)
         return q
 
-    def _nearest_arm_angle(self, T_world_flange: pin.SE3, angle: float, branch: int) -> Array:
+    def _nearest(self, T_world_flange: pin.SE3, q_previous: Array) -> Array:
+        """The configuration (n,) of the nearest admissible arm angle of the same branch; for other arms the nearest."""
+        kinematics = self._kinematics
+        if not isinstance(kinematics, SrsKinematics):
+            return kinematics.nearest(T_world_flange, q_previous)
         steps = np.column_stack([_ARM_ANGLE_STEPS, -_ARM_ANGLE_STEPS]).ravel()
-        found = self._kinematics.scan(T_world_flange, angle + steps)  # type: ignore[attr-defined]
-        same = np.flatnonzero(found.branches == branch)
+        found = kinematics.scan(T_world_flange, kinematics.arm_angle(q_previous) + steps)
+        same = np.flatnonzero(found.branches == kinematics.branch(q_previous))
         if not len(same):
             raise OutOfReach("the new pose", 0.0, "no arm angle near that of the plan is within the limits")
         return found.configurations[same[0]]
