@@ -112,12 +112,13 @@ def null_space_velocity(rate: Array, towards: Array, limit: Array, least_rate: f
         least_ratio: Least max-norm of the answer over the limits.
     """
     velocity = np.empty(rate.size)
-    _null_space_velocity(rate, towards, limit, least_rate, least_ratio, velocity)
+    write_null_space_velocity(rate, towards, limit, least_rate, least_ratio, velocity)
     return velocity
 
 
 @njit(cache=True, error_model="numpy")
-def _null_space_velocity(rate, towards, limit, least_rate, least_ratio, velocity):
+def write_null_space_velocity(rate, towards, limit, least_rate, least_ratio, velocity):
+    """Write `null_space_velocity` (n,), which may take the place of the rate."""
     ratio, along = 0.0, 0.0
     for i in range(rate.size):
         ratio = max(ratio, abs(rate[i]) / limit[i])

@@ -48,6 +48,7 @@ __all__ = [
     "circle_at",
     "joint_vector",
     "put_on_branch",
+    "write_null_space_rate",
 ]
 
 BRANCHES = 8
@@ -143,10 +144,8 @@ class SrsChain:
         Closer than 1e-6 the rates are therefore scaled to length one: J · rate = 0 holds everywhere, unit arm-angle
         rate does not hold there. Where the elbow turns all the same (the straight arm), the unit rate is kept.
         """
-        q = joint_vector(q)
-        _, a, b, _ = self.lengths
-        rate = np.empty(7)
-        if not _null_space_rate(q, a, b, rate):
+        q, rate = joint_vector(q), np.empty(7)
+        if not write_null_space_rate(q, self.lengths, rate):
             raise InvalidProblem("the wrist centre lies on the shoulder centre: there is no arm angle")
         return rate
 
@@ -313,8 +312,9 @@ def _share_turn(q, middle):
 
 
 @njit(cache=True, error_model="numpy")
-def _null_space_rate(q, a, b, rate):
+def write_null_space_rate(q, lengths, rate):
     """Write `SrsChain.null_space_rate`; whether there is an arm angle at all."""
+    a, b = lengths[1], lengths[2]
     L = np.sqrt(max(a * a + b * b + 2.0 * a * b * np.cos(q[3]), 0.0))
     if L < ALIGNED:
         return False

@@ -115,6 +115,11 @@ class SrsKinematics:
         lower, upper = self.limits.position_lower, self.limits.position_upper
         return 0.5 * (np.clip(lower, -full, full) + np.clip(upper, -full, full))
 
+    @cached_property
+    def arrays(self) -> tuple[Array, float, float, Array, Array, Array]:
+        """What compiled code takes for the arm: lengths, least and largest distance S–W (m); middles and limits."""
+        return self.lengths, *self._reach, self._middle, self.limits.position_lower, self.limits.position_upper
+
     def forward_kinematics(self, q: ArrayLike) -> pin.SE3:
         """T_world_flange at a configuration q (7,) (rad)."""
         return self._chain.forward_kinematics(q)
@@ -181,12 +186,8 @@ class SrsKinematics:
             raise InvalidProblem(
                 f"poses (K, 3, 4) and configurations (K, 7) expected, got {poses.shape} and {q_references.shape}"
             )
-        q, limits = np.empty((len(poses), 7)), self.limits
-        turn = follow_configurations(
-            poses, q_references, self.lengths, *self._reach, self._middle, limits.position_lower,
-            limits.position_upper, q,
-        )  # fmt: skip
-        return q, turn
+        q = np.empty((len(poses), 7))
+        return q, follow_configurations(poses, q_references, self.arrays, q)
 
     def scan(self, T_world_flange: pin.SE3, arm_angles: int | ArrayLike = ARM_ANGLES) -> SrsSolutions:
         """All configurations within the limits, over a grid of arm angles and all branches.

@@ -61,22 +61,23 @@ def nearest_configuration(elbow, rotations, grid, step, reference, weight, middl
 
 
 @njit(cache=True, error_model="numpy")
-def follow_configurations(poses, references, lengths, nearest, farthest, middle, lower, upper, out):
+def follow_configurations(poses, references, arm, out):
     """`SrsKinematics.follow`: write the configurations (K, 7), return the largest turn of a joint."""
     for k in range(len(poses)):
-        if not _follow(poses[k], references[k], lengths, nearest, farthest, middle, lower, upper, out[k]):
+        if not follow_configuration(poses[k], references[k], arm, out[k]):
             out[k] = np.nan
     return largest_difference(out.ravel(), references.ravel())
 
 
 @njit(cache=True, error_model="numpy")
-def _follow(pose, q_reference, lengths, nearest, farthest, middle, lower, upper, out):
-    """Write the configuration (7,) of one pose [R | p]; whether there is one."""
+def follow_configuration(pose, reference, arm, out):
+    """Write the configuration (7,) of one pose [R | p]; whether there is one. `arm` is `SrsKinematics.arrays`."""
+    lengths, nearest, farthest, middle, lower, upper = arm
     elbow, rotations, L = circle_at(pose[:, :3], pose[:, 3], lengths, nearest, farthest)
     if not (L >= ALIGNED and nearest - ROUNDING <= L <= farthest + ROUNDING):
         return False
-    angles, psi = np.empty(7), arm_angle_of(q_reference, lengths[1], lengths[2])
-    branch = (q_reference[1] < 0.0) + 2 * (q_reference[3] < 0.0) + 4 * (q_reference[5] < 0.0)
+    angles, psi = np.empty(7), arm_angle_of(reference, lengths[1], lengths[2])
+    branch = (reference[1] < 0.0) + 2 * (reference[3] < 0.0) + 4 * (reference[5] < 0.0)
     return _is_within(angles, angles_at(elbow, rotations, psi, angles), branch, middle, lower, upper, out)
 
 

@@ -14,7 +14,7 @@ from dyngrasp.errors import GraspRefused, OutOfReach
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.models.inverse_kinematics import joint_velocity, null_space_velocity
 from dyngrasp.planning.grasp_task import GraspTask
-from dyngrasp.signals import Array, read_only
+from dyngrasp.signals import Array, read_only, vector
 
 __all__ = [
     "BoundaryState",
@@ -37,8 +37,8 @@ class BoundaryState:
     velocity: Array
 
     def __post_init__(self) -> None:
-        for name in ("position", "velocity"):
-            object.__setattr__(self, name, read_only(getattr(self, name), (-1,)))
+        object.__setattr__(self, "position", vector(self.position))
+        object.__setattr__(self, "velocity", vector(self.velocity))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dyngrasp.errors import OutOfReach
+from dyngrasp.models.inverse_kinematics import joint_velocity
 from dyngrasp.models.srs_kinematics import SrsKinematics
-from dyngrasp.planning.grasp_targets import moved
+from dyngrasp.planning.grasp_targets import moved, swivel_velocity
 from dyngrasp.planning.replanning.target_update import TargetUpdater, updated_targets
 
 MOVES = {"x": st.floats(-0.04, 0.04), "y": st.floats(-0.04, 0.04), "turn": st.floats(-0.3, 0.3)}
@@ -65,10 +66,18 @@ def test_the_same_pose_gives_the_same_targets(task, targets):
     assert new.place is targets.place
 
 
-def test_hand_moves_with_a_moving_part_and_lifts(task, targets):
+@pytest.mark.parametrize("turn", [0.0, -0.48])
+def test_hand_moves_with_a_moving_part_and_lifts(task, targets, turn):
+    # Turned so far the limits forbid the arm angle of the plan at the pre-grasp.
     twist = np.array([0.05, -0.03, 0.0, 0.0, 0.0, 0.2])
     duration = 0.6
-    new = TargetUpdater(task).update(targets, targets.T_world_object, twist, 3.0, duration)
+    new = TargetUpdater(task).update(targets, displaced(targets.T_world_object, 0.0, 0.0, turn), twist, 3.0, duration)
+    kinematics = SrsKinematics.from_robot(task.robot)
+    kept = [
+        abs(kinematics.arm_angle(b.position) - kinematics.arm_angle(a.position)) < 1e-9
+        for a, b in ((targets.pregrasp, new.pregrasp), (targets.grasped, new.grasped))
+    ]
+    assert all(kept) == (turn == 0.0)
     robot, settings_ = task.robot, task.settings
     T = new.T_world_object
     for state, when, own in (
@@ -82,6 +91,10 @@ def test_hand_moves_with_a_moving_part_and_lifts(task, targets):
         flange = robot.forward_kinematics(state.position)
         velocity = robot.jacobian(state.position) @ state.velocity
         part = moved(T, twist, when)
+        like = targets.grasped if state is new.grasped else targets.pregrasp
+        swing = state.velocity - joint_velocity(robot, state.position, robot.jacobian(state.position) @ state.velocity)
+        wanted = swivel_velocity(state.position, state.position, task, like=like.velocity)
+        np.testing.assert_allclose(swing, wanted, rtol=0.0, atol=1e-12)
         carried = twist[:3] + np.cross(twist[3:], flange.translation - part.translation)
         assert np.abs(velocity[:3] - carried - own).max() < 1e-9
         assert np.abs(velocity[3:] - twist[3:]).max() < 1e-9

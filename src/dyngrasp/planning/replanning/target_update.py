@@ -9,10 +9,11 @@ import pinocchio as pin
 
 from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.models.grasp_object import Grasp
-from dyngrasp.models.inverse_kinematics import TWIST_TOLERANCE, inverse_kinematics_for, joint_velocity
+from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity
 from dyngrasp.models.srs_kinematics import SrsKinematics
-from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask, moved, swivel_velocity
-from dyngrasp.signals import Array, frozen
+from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask, swivel_velocity
+from dyngrasp.planning.replanning.boundary_states import flange_goals, srs_boundary_states
+from dyngrasp.signals import Array, frozen, read_only
 from dyngrasp.trajectory import largest_difference
 
 # Where the arm angle of the running plan is forbidden at the new pose, others are tried, nearest first (rad).
@@ -33,7 +34,13 @@ class TargetUpdater:
         self.task = task
         self._kinematics = inverse_kinematics_for(task.robot)
         self._hands: dict[bytes, pin.SE3] = {}
-        self._flanges: dict[tuple[Grasp, bytes, float], pin.SE3] = {}
+        self._flanges: dict[tuple[Grasp, bytes, bytes], tuple[Array, Array]] = {}
+        settings, chain, self._closed_form = task.settings, task.robot.flange_chain, None
+        self._speeds = float(settings.approach_speed), float(settings.lift_speed)
+        if isinstance(self._kinematics, SrsKinematics):
+            least = float(settings.swivel_rate), float(settings.swivel_speed_ratio)
+            swivel = task.robot.limits.velocity, *least
+            self._closed_form = self._kinematics.arrays, (chain.rotations, chain.offsets), swivel
 
     def update(
         self,
@@ -59,45 +66,37 @@ class TargetUpdater:
         Raises:
             OutOfReach: No posture of this branch reaches the new pose.
         """
-        task, settings, grasp = self.task, self.task.settings, previous.grasp
-        moving = twist_world is not None and bool(np.any(twist_world))
-        twist = _AT_REST if twist_world is None else np.asarray(twist_world, dtype=float)
-        T_before = moved(T_world_object, twist, -grasp_duration) if moving else T_world_object
-        T_grasp = T_world_object * self._flange_at(grasp, previous.gripper_closed, 0.0)
-        T_pregrasp = T_before * self._flange_at(grasp, previous.gripper_open, settings.pregrasp_distance)
-
-        q = self.posture(T_grasp, previous.grasped.position)
-        q_before = self.posture(T_pregrasp, previous.pregrasp.position)
-        approach, lift = np.zeros(6), np.zeros(6)
-        if moving:
-            approach, lift = _carried(twist, T_before, T_pregrasp), _carried(twist, T_world_object, T_grasp)
-        approach[:3] -= settings.approach_speed * (T_pregrasp.rotation @ self.outward(previous.gripper_open))
-        lift[2] += settings.lift_speed
-        try:
-            velocity_before, velocity = self._rates(q_before, approach), self._rates(q, lift)
-        except InvalidProblem as error:
-            raise OutOfReach("the grasp", 0.0, str(error)) from error
-        velocity_before += swivel_velocity(q_before, q_before, task, like=previous.pregrasp.velocity)
-        velocity += swivel_velocity(q, q, task, like=previous.grasped.velocity)
+        twist = _AT_REST if twist_world is None else read_only(twist_world, (6,))
+        before, at = previous.pregrasp, previous.grasped
+        like = before.position, before.velocity, at.position, at.velocity
+        aim = T_world_object.homogeneous, twist, float(grasp_duration), self._hands_at(previous), self._speeds
+        states = np.empty((2, 2, before.position.size))
+        if not (self._closed_form and srs_boundary_states(aim, like, _LARGEST_TURN, *self._closed_form, states)):
+            poses, twists = flange_goals(aim)
+            states[:, 0] = self.postures(poses, np.array(like[::2]))
+            for (q, velocity), twist_flange, way in zip(states, twists, like[1::2], strict=True):
+                velocity[:] = self._velocity(q, twist_flange, way)
+        frozen(states)
         return GraspTargets(
-            T_world_object=T_world_object,
-            grasp=grasp,
-            pregrasp=BoundaryState(frozen(q_before), frozen(velocity_before)),
-            grasped=BoundaryState(frozen(q), frozen(velocity)),
-            place=previous.place,
-            gripper_open=previous.gripper_open,
-            gripper_closed=previous.gripper_closed,
-            grasp_time=grasp_time,
-            grasp_duration=grasp_duration,
-            twist_world=twist,
+            T_world_object,
+            previous.grasp,
+            BoundaryState(states[0, 0], states[0, 1]),
+            BoundaryState(states[1, 0], states[1, 1]),
+            previous.place,
+            previous.gripper_open,
+            previous.gripper_closed,
+            grasp_time,
+            grasp_duration,
+            twist,
         )
 
-    def _rates(self, q: Array, twist_world: Array) -> Array:
-        """Joint rates (n,) for a twist of the flange; far from singular postures there is nothing to be looked at."""
-        found = self.task.robot.flange_chain.least_rates(q, twist_world)
-        if found is not None and found[1] <= TWIST_TOLERANCE:
-            return found[0]
-        return joint_velocity(self.task.robot, q, twist_world)
+    def _velocity(self, q: Array, twist_world: Array, like: Array) -> Array:
+        """(n,) velocity for a twist of the flange, with a swing of the elbow the way of another velocity."""
+        try:
+            rate = joint_velocity(self.task.robot, q, twist_world)
+        except InvalidProblem as error:
+            raise OutOfReach("the grasp", 0.0, str(error)) from error
+        return rate + swivel_velocity(q, q, self.task, like)
 
     def T_flange_grasp(self, posture: Array) -> pin.SE3:
         """The grasp frame as the hand holds it with its fingers in a posture (m,), in the flange frame."""
@@ -110,16 +109,19 @@ class TargetUpdater:
             self._hands[key] = gripper.T_flange_hand * gripper.T_hand_grasp(posture)
         return self._hands[key]
 
-    def outward(self, posture: Array) -> Array:
-        """(3,) axis of the grasp frame that points away from the part, in the flange frame."""
-        return self.T_flange_grasp(posture).rotation[:, 2]
-
-    def _flange_at(self, grasp: Grasp, posture: Array, height: float) -> pin.SE3:
-        """The flange in the object frame with the hand at a height above the grasp frame (m)."""
-        key = grasp, posture.tobytes(), height
+    def _hands_at(self, targets: GraspTargets) -> tuple[Array, Array]:
+        """The fourth of what `flange_goals` takes: they change with the fingers and the grasp alone."""
+        key = targets.grasp, targets.gripper_open.tobytes(), targets.gripper_closed.tobytes()
         if key not in self._flanges:
-            above = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
-            self._flanges[key] = grasp.T_object_grasp * above * self.T_flange_grasp(posture).inverse()
+            T_object_grasp = targets.grasp.T_object_grasp
+            above = pin.SE3(np.eye(3), np.array([0.0, 0.0, self.task.settings.pregrasp_distance]))
+            hand = self.T_flange_grasp(targets.gripper_open)
+            flanges = (
+                T_object_grasp * above * hand.inverse(),
+                T_object_grasp * self.T_flange_grasp(targets.gripper_closed).inverse(),
+            )
+            poses = np.array([flange.homogeneous[:3] for flange in flanges])
+            self._flanges[key] = poses, np.array(hand.rotation[:, 2])
         return self._flanges[key]
 
     def posture(self, T_world_flange: pin.SE3, q_previous: Array) -> Array:
@@ -185,11 +187,3 @@ def updated_targets(previous: GraspTargets, T_world_object: pin.SE3, task: Grasp
 def target_updater(task: GraspTask) -> TargetUpdater:
     """The updater of a task, made once."""
     return TargetUpdater(task)
-
-
-def _carried(twist: Array, T_world_object: pin.SE3, T_world_flange: pin.SE3) -> Array:
-    """(6,) twist of the flange as it would be fixed to the part."""
-    lever = T_world_flange.translation - T_world_object.translation
-    carried = twist.copy()
-    carried[:3] += pin.skew(twist[3:]) @ lever
-    return carried
