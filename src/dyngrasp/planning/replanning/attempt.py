@@ -110,7 +110,7 @@ class Attempt:
         """All ways towards targets, the first of them tracked already if its candidate is given."""
         phase, previous = self.plan.phase_at(self.splice), self.previous
         if phase == APPROACH:
-            self.recovery = self._recovery(self.state, targets)
+            self.recovery = self._recovery(self.splice, targets)
             if self.recovery is None:
                 return self._fresh_or_kept(targets, estimate, "the hand is beside the part, below the new grasp frame")
         status, best = Status.INFEASIBLE, None
@@ -172,9 +172,9 @@ class Attempt:
         self._count("tracking", started)
         return candidate
 
-    def _recovery(self, state: PlanSample, targets: GraspTargets) -> FunnelRecovery | None:
-        shares, reaction = self.settings.recovery_shares, self.settings.reaction
-        return funnel_recovery(self.plan, state, targets, self.task, shares, reaction)
+    def _recovery(self, splice: float, targets: GraspTargets) -> FunnelRecovery | None:
+        settings = self.settings
+        return funnel_recovery(self.plan, splice, targets, self.task, settings.recovery_shares, settings.reaction)
 
     @cached_property
     def _keeps_moving(self) -> bool:
@@ -279,7 +279,7 @@ class Attempt:
         except (OutOfReach, GraspRefused) as error:
             self._count("fresh", started)
             return self._kept(Status.INFEASIBLE, targets, f"fresh plan: {error}")
-        recovery = self._recovery(state, targets)
+        recovery = self._recovery(splice, targets)
         fresh, problems, why = None, None, "the hand is beside the part, below the new grasp frame"
         if recovery is not None:
             problems, why = self.full.problems(state, left, targets, recovery)

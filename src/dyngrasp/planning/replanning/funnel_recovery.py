@@ -23,10 +23,11 @@ from numba import njit
 
 from dyngrasp.models.flange_chain import place_frames
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.part_motion import part_poses
 from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import GraspPlan, PlanSample
+from dyngrasp.trajectory import GraspPlan, interpolate
 
 # Of the constraint's parameters: three of G, nine of the grasp frame's axes by rows, three of its origin, then z_th.
 _AXES, _ORIGIN, _HEIGHT_PARAMETER = slice(3, 12), slice(12, 15), 15
@@ -69,39 +70,34 @@ class FunnelRecovery:
 
 
 def funnel_recovery(
-    plan: GraspPlan,
-    state: PlanSample,
-    targets: GraspTargets,
-    task: GraspTask,
-    shares: tuple[float, float],
-    reaction: float,
+    plan: GraspPlan, t: float, targets: GraspTargets, task: GraspTask, shares: tuple[float, float], reaction: float
 ) -> FunnelRecovery | None:
     """The softening that a replan needs; None if the hand is below the grasp frame and no softening helps.
 
     Args:
         plan: The running plan, in its approach.
-        state: Of the plan where the new trajectory takes over.
+        t: When the new trajectory takes over (s).
         targets: The new targets.
         task: Arm, gripper, part.
         shares: σ_0 and σ_1.
         reaction: τ (s).
     """
-    later = min(state.arm.t + reaction, math.nextafter(float(plan.phase_ends[0]), 0.0))
-    local = later - plan.start_time
-    (q_later, *_), (hand_later, *_) = (motion.sample_many((local,)) for motion in (plan.arm[0], plan.gripper[0]))
-    factor = 1.0
-    for t, q, hand in (
-        (state.arm.t, state.arm.position, state.gripper.position),
-        (later, q_later[0], hand_later[0]),
-    ):
-        height, wall = _height_and_wall(t, q, hand, targets, task)
-        if height - wall >= _MARGIN:
-            continue
-        inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
-        if inside <= 0:
-            return None
-        factor = min(factor, inside / wall)
-    return FunnelRecovery(factor, shares)
+    times = t, min(t + reaction, math.nextafter(float(plan.phase_ends[0]), 0.0))
+    (arm, *_), (gripper, *_), _ = plan.arrays
+    hands = np.empty((2, len(plan.gripper_joints)))
+    _write_positions(gripper, plan.start_time, times, hands)
+    updater, chain, funnel = target_updater(task), task.robot.flange_chain, task.grasp_object.funnel
+    factor = _largest_factor(
+        arm,
+        plan.start_time,
+        times,
+        (updater.T_flange_grasp(hands[0]).translation, updater.T_flange_grasp(hands[1]).translation),
+        (chain.rotations, chain.offsets),
+        (targets.T_world_object.homogeneous, targets.twist_world, float(targets.grasp_time)),
+        targets.grasp.T_object_grasp.homogeneous,
+        (funnel.z_threshold, funnel.sigma_x, funnel.sigma_y),
+    )
+    return FunnelRecovery(factor, shares) if factor > 0.0 else None
 
 
 def lifted(constraint: NodeConstraint, by: Array) -> NodeConstraint:
@@ -112,33 +108,58 @@ def lifted(constraint: NodeConstraint, by: Array) -> NodeConstraint:
     return replace(constraint, parameters=parameters)
 
 
-def _height_and_wall(t: float, q: Array, hand: Array, targets: GraspTargets, task: GraspTask) -> tuple[float, float]:
-    """Height of G in the grasp frame and that of the wall below or above it, eq. (5) (m), at a time and postures."""
-    funnel, chain = task.grasp_object.funnel, task.robot.flange_chain
-    T_world_grasp = targets.T_world_object_at(t) * targets.grasp.T_object_grasp
-    x, y, z = _seen_from_grasp(
-        chain.rotations,
-        chain.offsets,
-        q,
-        target_updater(task).T_flange_grasp(hand).translation,
-        T_world_grasp.rotation,
-        T_world_grasp.translation,
-    )
-    bell = math.exp(-0.5 * ((x / funnel.sigma_x) ** 2 + (y / funnel.sigma_y) ** 2))
-    return z, funnel.z_threshold * (1.0 - bell)
+@njit(cache=True, error_model="numpy")
+def _write_positions(trajectory, start, times, q):
+    """Write positions (M, n) at M times (s) of a motion that begins at `start` (s)."""
+    states = np.empty((3, *q.shape))
+    interpolate(trajectory, np.array(times) - start, states)
+    q[:] = states[0]
 
 
 @njit(cache=True, error_model="numpy")
-def _seen_from_grasp(rotations, offsets, q, p_flange_G, R_world_grasp, p_world_grasp):
+def _largest_factor(arm, start, times, points, chain, part, T_object_grasp, funnel):
+    """φ_0 of a motion of the arm that begins at `start` (s); 0 where none helps.
+
+    Args:
+        arm: `Trajectory.arrays`.
+        start: See above.
+        times: M of them (s) at which G has to be inside the wall.
+        points: G at each of them, (3,) in the flange frame (m).
+        chain: `FlangeChain.rotations` and `.offsets`.
+        part: Pose (4, 4) of the part when it is taken, its twist (6,) until then, and that time (s).
+        T_object_grasp: (4, 4) grasp frame in the object frame.
+        funnel: z_th and the standard deviations along x and y (m).
+    """
+    (T, twist, arrival), (z_threshold, sigma_x, sigma_y), M = part, funnel, len(times)
+    R, p, q = np.empty((3, 3, M)), np.empty((3, M)), np.empty((M, chain[1].shape[0] - 1))
+    part_poses((T[:3, :3], T[:3, 3], twist, arrival), np.array(times), R, p)
+    _write_positions(arm, start, times, q)
+    factor = 1.0
+    for m in range(M):
+        x, y, height = _seen_from_grasp(chain, q[m], points[m], R[:, :, m], p[:, m], T_object_grasp)
+        wall = z_threshold * (1.0 - np.exp(-0.5 * ((x / sigma_x) ** 2 + (y / sigma_y) ** 2)))
+        if height - wall < _MARGIN:
+            inside = min(_INSIDE * height, height - 1.2 * _MARGIN)
+            if inside <= 0.0:
+                return 0.0
+            factor = min(factor, inside / wall)
+    return factor
+
+
+@njit(cache=True, error_model="numpy")
+def _seen_from_grasp(chain, q, p_flange_G, R_world_object, p_world_object, T_object_grasp):
     """Coordinates of G in the grasp frame (m), the arm at q (n,)."""
-    frames = np.empty((q.size + 1, 3, 4))
-    place_frames(rotations, offsets, q, frames)
-    x, y, z = 0.0, 0.0, 0.0
+    frames, in_world, in_object, in_grasp = np.empty((q.size + 1, 3, 4)), np.empty(3), np.empty(3), np.zeros(3)
+    place_frames(chain[0], chain[1], q, frames)
     for a in range(3):
-        lever = frames[-1, a, 3] - p_world_grasp[a]
+        in_world[a] = frames[-1, a, 3] - p_world_object[a]
         for b in range(3):
-            lever += frames[-1, a, b] * p_flange_G[b]
-        x += R_world_grasp[a, 0] * lever
-        y += R_world_grasp[a, 1] * lever
-        z += R_world_grasp[a, 2] * lever
-    return x, y, z
+            in_world[a] += frames[-1, a, b] * p_flange_G[b]
+    for a in range(3):
+        in_object[a] = -T_object_grasp[a, 3]
+        for b in range(3):
+            in_object[a] += R_world_object[b, a] * in_world[b]
+    for a in range(3):
+        for b in range(3):
+            in_grasp[a] += T_object_grasp[b, a] * in_object[b]
+    return in_grasp[0], in_grasp[1], in_grasp[2]
