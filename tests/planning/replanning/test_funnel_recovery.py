@@ -54,4 +54,4 @@ def test_wall_is_lowered_as_far_as_the_hand_needs_and_no_farther(plan, targets, 
         assert (found.factor if found else 0.0) == pytest.approx(wanted, abs=1e-9)
         seen.append(wanted)
     # All three answers: nothing to be done, a factor, no help.
-    assert min(seen.count(0.0), seen.count(1.0), sum(0.0 < factor < 1.0 for factor in seen)) > 20
+    assert min(seen.count(0.0), seen.count(1.0), sum(0.0 < factor < 1.0 for factor in seen)) >= 10
