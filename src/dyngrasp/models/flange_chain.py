@@ -84,10 +84,17 @@ class FlangeChain:
 def place_frames(rotations, offsets, q, frames):
     """Write the frames [R | p] (n+1, 3, 4) of all joints and of the flange in the world, at q (n,) (rad)."""
     for i in range(offsets.shape[0]):
-        if i == 0:
-            frames[0, :, :3], frames[0, :, 3] = rotations[0], offsets[0]
-        else:
-            _put_after(frames[i - 1], rotations[i], offsets[i], frames[i])
+        # Element by element: a slice that is assigned to becomes ten times the machine code.
+        for a in range(3):
+            if i == 0:
+                frames[0, a, 3] = offsets[0, a]
+                for b in range(3):
+                    frames[0, a, b] = rotations[0, a, b]
+            else:
+                x, y, z = frames[i - 1, a, 0], frames[i - 1, a, 1], frames[i - 1, a, 2]
+                frames[i, a, 3] = frames[i - 1, a, 3] + x * offsets[i, 0] + y * offsets[i, 1] + z * offsets[i, 2]
+                for b in range(3):
+                    frames[i, a, b] = x * rotations[i, 0, b] + y * rotations[i, 1, b] + z * rotations[i, 2, b]
         if i < q.size:
             c, s = np.cos(q[i]), np.sin(q[i])
             for a in range(3):
@@ -96,21 +103,16 @@ def place_frames(rotations, offsets, q, frames):
 
 
 @njit(cache=True, error_model="numpy")
-def _put_after(before, rotation, offset, frame):
-    for a in range(3):
-        x, y, z = before[a, 0], before[a, 1], before[a, 2]
-        for b in range(3):
-            frame[a, b] = x * rotation[0, b] + y * rotation[1, b] + z * rotation[2, b]
-        frame[a, 3] = before[a, 3] + x * offset[0] + y * offset[1] + z * offset[2]
-
-
-@njit(cache=True, error_model="numpy")
 def _jacobian(frames, J):
     """Write the Jacobian (6, n) of the flange, linear rows before angular ones in world axes, from the frames."""
-    flange = frames[-1]
-    for i in range(J.shape[1]):
+    n = J.shape[1]
+    for i in range(n):
         ax, ay, az = frames[i, 0, 2], frames[i, 1, 2], frames[i, 2, 2]
-        rx, ry, rz = flange[0, 3] - frames[i, 0, 3], flange[1, 3] - frames[i, 1, 3], flange[2, 3] - frames[i, 2, 3]
+        rx, ry, rz = (
+            frames[n, 0, 3] - frames[i, 0, 3],
+            frames[n, 1, 3] - frames[i, 1, 3],
+            frames[n, 2, 3] - frames[i, 2, 3],
+        )
         J[0, i], J[1, i], J[2, i] = ay * rz - az * ry, az * rx - ax * rz, ax * ry - ay * rx
         J[3, i], J[4, i], J[5, i] = ax, ay, az
 
@@ -211,9 +213,9 @@ def least_rates(rotations, offsets, q, twist, rates):
         for other in range(row):
             y[row] -= L[row, other] * y[other]
         y[row] /= L[row, row]
-    rates[:] = 0.0
-    for row in range(6):
-        for i in range(n):
+    for i in range(n):
+        rates[i] = 0.0
+        for row in range(6):
             rates[i] += Q[row, i] * y[row]
     missing = 0.0
     for row in range(6):

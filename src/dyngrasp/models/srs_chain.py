@@ -37,20 +37,6 @@ from dyngrasp.signals import Array, read_only
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-__all__ = [
-    "ALIGNED",
-    "BRANCHES",
-    "ROUNDING",
-    "ElbowCircle",
-    "SrsChain",
-    "angles_at",
-    "arm_angle_of",
-    "circle_at",
-    "joint_vector",
-    "put_on_branch",
-    "write_null_space_rate",
-]
-
 BRANCHES = 8
 VERTICAL = 1e-9
 """Angle (rad) between S–W and the base's z axis below which the reference direction is x: rounding alone makes the
@@ -181,15 +167,22 @@ def joint_vector(q: ArrayLike) -> Array:
     return q
 
 
+# From here on three numbers are a tuple and no array, and nothing is assigned to slices: both become much machine code,
+# which a replanning cycle, where it runs but once or twice, has to wait for.
+
+
 @njit(cache=True, error_model="numpy")
 def _shoulder_to_wrist(q, a, b):
     """Unit vector u from S to W and the y axis of the upper arm (opposite to joint 4's axis), both in the base."""
     c1, c2, c3, s1, s2, s3 = np.cos(q[0]), np.cos(q[1]), np.cos(q[2]), np.sin(q[0]), np.sin(q[1]), np.sin(q[2])
-    x = np.array([c1 * c2 * c3 - s1 * s3, s1 * c2 * c3 + c1 * s3, -s2 * c3])
-    y = np.array([-c1 * c2 * s3 - s1 * c3, -s1 * c2 * s3 + c1 * c3, s2 * s3])
-    z = np.array([c1 * s2, s1 * s2, c2])
-    w = -b * np.sin(q[3]) * x + (a + b * np.cos(q[3])) * z
-    return w / max(np.sqrt((w**2).sum()), ALIGNED), y
+    along_x, along_z = -b * np.sin(q[3]), a + b * np.cos(q[3])
+    u = (
+        along_x * (c1 * c2 * c3 - s1 * s3) + along_z * (c1 * s2),
+        along_x * (s1 * c2 * c3 + c1 * s3) + along_z * (s1 * s2),
+        along_x * (-s2 * c3) + along_z * c2,
+    )
+    L = max(np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]), ALIGNED)
+    return (u[0] / L, u[1] / L, u[2] / L), (-c1 * c2 * s3 - s1 * c3, -s1 * c2 * s3 + c1 * c3, s2 * s3)
 
 
 @njit(cache=True, error_model="numpy")
@@ -197,11 +190,11 @@ def arm_angle_of(q, a, b):
     """`SrsChain.arm_angle` for the lengths a and b of upper arm and forearm (m)."""
     u, y = _shoulder_to_wrist(q, a, b)
     # Joint 4's axis instead of the elbow's offset from S–W: it keeps its direction where the offset vanishes.
-    h = np.array([y[1] * u[2] - y[2] * u[1], y[2] * u[0] - y[0] * u[2], y[0] * u[1] - y[1] * u[0]])
-    if q[3] < 0.0:
-        h = -h
+    h = (y[1] * u[2] - y[2] * u[1], y[2] * u[0] - y[0] * u[2], y[0] * u[1] - y[1] * u[0])
+    side = -1.0 if q[3] < 0.0 else 1.0
     e, g = _reference_directions(u)
-    return np.arctan2((h * g).sum(), (h * e).sum())
+    along_e, along_g = h[0] * e[0] + h[1] * e[1] + h[2] * e[2], h[0] * g[0] + h[1] * g[1] + h[2] * g[2]
+    return np.arctan2(side * along_g, side * along_e)
 
 
 @njit(cache=True, error_model="numpy")
@@ -210,18 +203,18 @@ def _reference_directions(u):
     level = np.hypot(u[0], u[1])
     if level < VERTICAL:
         # To first order in the tilt of u: exact in double precision below VERTICAL.
-        return np.array([1.0, 0.0, -u[0] * u[2]]), np.array([0.0, u[2], -u[1]])
+        return (1.0, 0.0, -u[0] * u[2]), (0.0, u[2], -u[1])
     cx, cy = u[0] / level, u[1] / level
-    return np.array([-u[2] * cx, -u[2] * cy, level]), np.array([cy, -cx, 0.0])
+    return (-u[2] * cx, -u[2] * cy, level), (cy, -cx, 0.0)
 
 
 @njit(cache=True, error_model="numpy")
 def circle_at(R, p, lengths, nearest, farthest):
     """`ElbowCircle.elbow` and `.rotations` for a flange pose with S–W brought into its bounds, and S–W as it is."""
-    base, a, b, tool = lengths
-    wrist = np.array([p[0] - tool * R[0, 2], p[1] - tool * R[1, 2], p[2] - tool * R[2, 2] - base])
-    true_L = np.sqrt((wrist**2).sum())
-    u = wrist / true_L
+    base, a, b, tool = lengths[0], lengths[1], lengths[2], lengths[3]
+    wx, wy, wz = p[0] - tool * R[0, 2], p[1] - tool * R[1, 2], p[2] - tool * R[2, 2] - base
+    true_L = np.sqrt(wx * wx + wy * wy + wz * wz)
+    u = (wx / true_L, wy / true_L, wz / true_L)
     L = min(max(true_L, nearest), farthest)
     # The half-angle form keeps its precision near the straight and the folded elbow; acos loses half the digits.
     elbow = 2.0 * np.arctan2(
@@ -234,23 +227,23 @@ def circle_at(R, p, lengths, nearest, farthest):
     e, g = _reference_directions(u)
     # Elbow direction h = cos ψ e + sin ψ g; columns of R03 for q4 ≥ 0: x = cos α h − sin α u, y = u × h,
     # z = cos α u + sin α h, with α the angle at the shoulder between S–W and the upper arm.
-    R03 = np.zeros((3, 3, 3))
+    rotations = np.zeros((3, 18))
     for i in range(3):
-        R03[0, i, 0], R03[0, i, 1], R03[0, i, 2] = cos_alpha * e[i], g[i], sin_alpha * e[i]
-        R03[1, i, 0], R03[1, i, 1], R03[1, i, 2] = cos_alpha * g[i], -e[i], sin_alpha * g[i]
-        R03[2, i, 0], R03[2, i, 2] = -sin_alpha * u[i], cos_alpha * u[i]
-    R34 = ((c4, 0.0, -s4), (0.0, 1.0, 0.0), (s4, 0.0, c4))
-    rotations = np.empty((3, 18))
+        rotations[0, 3 * i], rotations[0, 3 * i + 1], rotations[0, 3 * i + 2] = cos_alpha * e[i], g[i], sin_alpha * e[i]
+        rotations[1, 3 * i], rotations[1, 3 * i + 1], rotations[1, 3 * i + 2] = (
+            cos_alpha * g[i],
+            -e[i],
+            sin_alpha * g[i],
+        )
+        rotations[2, 3 * i], rotations[2, 3 * i + 2] = -sin_alpha * u[i], cos_alpha * u[i]
+    # R47 = (R03 R34)ᵀ R, where R34 turns by the elbow angle about −y.
     for k in range(3):
         for i in range(3):
+            x, y, z = rotations[k, 3 * i], rotations[k, 3 * i + 1], rotations[k, 3 * i + 2]
             for j in range(3):
-                rotations[k, 3 * i + j] = R03[k, i, j]
-                # R47 = (R03 R34)ᵀ R
-                total = 0.0
-                for m in range(3):
-                    for n in range(3):
-                        total += R34[n][i] * R03[k, m, n] * R[m, j]
-                rotations[k, 9 + 3 * i + j] = total
+                rotations[k, 9 + j] += (c4 * x + s4 * z) * R[i, j]
+                rotations[k, 12 + j] += y * R[i, j]
+                rotations[k, 15 + j] += (c4 * z - s4 * x) * R[i, j]
     return elbow, rotations, true_L
 
 
@@ -261,9 +254,8 @@ def angles_at(elbow, rotations, psi, angles):
     `elbow` and `rotations` are those of the `ElbowCircle`.
     """
     c, s = np.cos(psi), np.sin(psi)
-    shoulder, wrist = _zyz_angles(rotations, 0, c, s, angles[:3]), _zyz_angles(rotations, 9, c, s, angles[4:])
     angles[3] = elbow
-    return shoulder, wrist
+    return _zyz_angles(rotations, 0, c, s, angles, 0), _zyz_angles(rotations, 9, c, s, angles, 4)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -273,19 +265,18 @@ def put_on_branch(angles, aligned, branch, q):
     for i in range(7):
         q[i] = angles[i] * _SIGNS[branch, i] + _TURNS[branch, i]
     if shoulder:
-        _share_turn(q[:3], angles[1])
+        _share_turn(q, 0, angles[1])
     if wrist:
-        _share_turn(q[4:], angles[5])
+        _share_turn(q, 4, angles[5])
 
 
 @njit(cache=True, error_model="numpy")
-def _zyz_angles(rotations, first, c, s, out):
-    """Angles (3,) of R = Rz Ry Rz, the middle one in [0, π]; returns whether that is 0 or π.
+def _zyz_angles(rotations, j, c, s, angles, first):
+    """Write the three angles of R = Rz Ry Rz from `first` on, the middle one in [0, π]; whether that is 0 or π.
 
-    R is c and s times two rows of `rotations` and once the third, row by row from column `first` on. Where the middle
-    angle is 0 or π, the first one is zero and the third takes all of the turn.
+    R is c and s times two rows of `rotations` and once the third, row by row from column j on. Where the middle angle
+    is 0 or π, the first one is zero and the third takes all of the turn.
     """
-    j = first
     xx = c * rotations[0, j] + s * rotations[1, j] + rotations[2, j]
     xy = c * rotations[0, j + 1] + s * rotations[1, j + 1] + rotations[2, j + 1]
     xz = c * rotations[0, j + 2] + s * rotations[1, j + 2] + rotations[2, j + 2]
@@ -297,18 +288,19 @@ def _zyz_angles(rotations, first, c, s, out):
     aligned = tilt < ALIGNED
     # cos and sin of the first angle. From the upper two rows instead of the last one, which vanishes with the tilt.
     cosine, sine = (1.0, 0.0) if aligned else (xz / tilt, yz / tilt)
-    out[0], out[1] = 0.0 if aligned else np.arctan2(yz, xz), np.arctan2(tilt, zz)
-    out[2] = np.arctan2(cosine * yx - sine * xx, cosine * yy - sine * xy)
+    angles[first] = 0.0 if aligned else np.arctan2(yz, xz)
+    angles[first + 1] = np.arctan2(tilt, zz)
+    angles[first + 2] = np.arctan2(cosine * yx - sine * xx, cosine * yy - sine * xy)
     return aligned
 
 
 @njit(cache=True, error_model="numpy")
-def _share_turn(q, middle):
+def _share_turn(q, first, middle):
     """Let the neighbours of an aligned joint share their turn equally, in place; at 0 they add up, at π subtract."""
     sign = -1.0 if middle > 0.5 * np.pi else 1.0
-    turn = q[2] + sign * q[0]
+    turn = q[first + 2] + sign * q[first]
     turn -= 2.0 * np.pi * np.rint(turn / (2.0 * np.pi))
-    q[0], q[2] = 0.5 * sign * turn, 0.5 * turn
+    q[first], q[first + 2] = 0.5 * sign * turn, 0.5 * turn
 
 
 @njit(cache=True, error_model="numpy")
@@ -319,21 +311,27 @@ def write_null_space_rate(q, lengths, rate):
     if L < ALIGNED:
         return False
     u, _ = _shoulder_to_wrist(q, a, b)
-    k_s = _euler_rates(q[0], q[1], u, rate[:3])
-    k_w = _euler_rates(q[4], q[5], np.array([-a * np.sin(q[3]), 0.0, -(b + a * np.cos(q[3]))]) / L, rate[4:])
+    shoulder = _write_euler_rates(q[0], q[1], u, rate, 0)
+    seen_from_wrist = (-a * np.sin(q[3]) / L, 0.0, -(b + a * np.cos(q[3])) / L)
+    wrist = _write_euler_rates(q[4], q[5], seen_from_wrist, rate, 4)
     rate[3] = 0.0
-    if k_s == 1.0 and k_w == 1.0:
+    if shoulder == 1.0 and wrist == 1.0:
         return True
-    if k_s != 0.0 or k_w != 0.0:
-        rate[:3] *= k_w
-    rate[4:] *= k_s
-    rate /= np.sqrt((rate**2).sum())
+    by_wrist, size = wrist if shoulder != 0.0 or wrist != 0.0 else 1.0, 0.0
+    for i in range(7):
+        rate[i] *= by_wrist if i < 3 else shoulder
+        size += rate[i] * rate[i]
+    for i in range(7):
+        rate[i] /= np.sqrt(size)
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _euler_rates(first, middle, omega, rates):
-    """Write k · rates (3,) of Rz(first) Ry(middle) Rz(third) for angular velocity omega; k ≤ 1 keeps them finite."""
+def _write_euler_rates(first, middle, omega, rate, at):
+    """Write k · rates (3,) of Rz(first) Ry(middle) Rz(third) for angular velocity omega from `at` on; returns k.
+
+    k ≤ 1 keeps them finite.
+    """
     c, s = np.cos(first), np.sin(first)
     along, across = c * omega[0] + s * omega[1], -s * omega[0] + c * omega[1]
     sine, cosine = np.sin(middle), np.cos(middle)
@@ -343,5 +341,5 @@ def _euler_rates(first, middle, omega, rates):
         third, k = 0.0, 1.0
     else:
         third, k = along, sine
-    rates[0], rates[1], rates[2] = k * omega[2] - cosine * third, k * across, third
+    rate[at], rate[at + 1], rate[at + 2] = k * omega[2] - cosine * third, k * across, third
     return k

@@ -40,9 +40,11 @@ def part_poses(motion, times, R, p):
         x, y, z = x / rate, y / rate, z / rate
     if rate == 0.0 and twist[0] == 0.0 and twist[1] == 0.0 and twist[2] == 0.0:
         for a in range(3):
-            p[a, : times.size] = position[a]
+            for s in range(times.size):
+                p[a, s] = position[a]
             for b in range(3):
-                R[a, b, : times.size] = rotation[a, b]
+                for s in range(times.size):
+                    R[a, b, s] = rotation[a, b]
         return
     for s in range(times.size):
         before = min(times[s] - arrival, 0.0)
