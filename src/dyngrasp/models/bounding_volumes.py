@@ -14,98 +14,95 @@ from dyngrasp.signals import Array, read_only
 
 
 class Bodies(NamedTuple):
-    """Volumes around B bodies on F links, each in the frame of its link (m); make it with `bounding_bodies`.
+    """Volumes around B bodies on F links (m); make it with `bounding_bodies`.
+
+    All are given in the frame of their link, moved to the middle of the capsule around all its bodies.
 
     Attributes:
-        links: (B,) index of the link that each is fixed to.
         ends: (B, 2, 3) ends of the segment of a capsule around the body.
         radii: (B,) radius of that capsule.
         halves: (B, 3, 3) half the edges, one a row, of a box about the middle of the segment that, rounded off with
             `rounding`, contains the body too. For a box it is the box itself, for all others the segment.
         rounding: (B,)
-        reaches: (B,) no point of the body is farther from the middle of its link's capsule.
-        members: (B,) all bodies, link after link.
-        firsts: (F + 1,) where in `members` those of a link begin.
+        firsts: (F + 1,) the first body of each link, and one after the last.
         link_ends: (F, 2, 3) a capsule around all bodies of a link; of one that has none, nothing.
         link_radii: (F,)
-        link_reaches: (F,) half its length.
+        reaches: (F,) no point of a body is farther from the middle of its link.
     """
 
-    links: NDArray[np.int64]
     ends: Array
     radii: Array
     halves: Array
     rounding: Array
-    reaches: Array
-    members: NDArray[np.int64]
     firsts: NDArray[np.int64]
     link_ends: Array
     link_radii: Array
-    link_reaches: Array
+    reaches: Array
 
 
 class Pieces(NamedTuple):
-    """Boxes around the P convex pieces of a part, in the frame of the part (m).
+    """Boxes around the P convex pieces of a part, in its frame, moved to the middle of all of them (m).
 
     Attributes:
-        low, high: (P, 3) opposite corners.
+        low, high: (3, P) opposite corners.
         around: (2, 3) corners of the box around all of them.
-        reaches: (P,) no point of a piece is farther from the middle of that.
         first: Number of the first piece among all bodies.
     """
 
     low: Array
     high: Array
     around: Array
-    reaches: Array
     first: int
 
 
-def bounding_bodies(shapes: list[Any], placements: list[pin.SE3], links: NDArray[np.int64], count: int) -> Bodies:
-    """Volumes around bodies that are fixed to links.
+def bounding_bodies(
+    shapes: list[Any], placements: list[pin.SE3], links: NDArray[np.int64], count: int
+) -> tuple[Bodies, Array]:
+    """Volumes around bodies that are fixed to links, and the middle of each link (F, 3) in its frame (m).
 
     Args:
         shapes: Primitives or meshes of Coal.
         placements: Of each in the frame of its link.
-        links: (B,) which of the `count` links.
+        links: (B,) which of the `count` links, in this order.
         count: F, the number of links.
     """
-    ends, radii, halves, rounding = [], [], [], []
-    for shape, placement in zip(shapes, placements, strict=True):
-        segment, radius = bounding_capsule(shape)
-        placed = np.array([placement.act(end) for end in segment])
-        ends.append(placed)
-        radii.append(radius)
+    ends, radii, halves, rounding = np.zeros((len(shapes), 2, 3)), np.zeros(len(shapes)), [], []
+    for b, (shape, placement) in enumerate(zip(shapes, placements, strict=True)):
+        segment, radii[b] = bounding_capsule(shape)
+        ends[b] = [placement.act(end) for end in segment]
         if isinstance(shape, coal.Box):
             halves.append(np.ravel(shape.halfSide)[:, None] * placement.rotation.T)
             rounding.append(0.0)
         else:
-            halves.append(np.vstack([(placed[1] - placed[0]) / 2, np.zeros((2, 3))]))
-            rounding.append(radius)
-    link_ends, link_radii, reaches = np.zeros((count, 2, 3)), np.zeros(count), np.zeros(len(shapes))
+            halves.append(np.vstack([(ends[b, 1] - ends[b, 0]) / 2, np.zeros((2, 3))]))
+            rounding.append(radii[b])
+    firsts = np.searchsorted(links, np.arange(count + 1))
+    link_ends, link_radii, reaches = np.zeros((count, 2, 3)), np.zeros(count), np.zeros(count)
     for link in np.unique(links):
-        on_it = np.flatnonzero(links == link)
-        link_ends[link], link_radii[link] = _around(np.array(ends)[on_it], np.array(radii)[on_it])
+        own = slice(firsts[link], firsts[link + 1])
+        link_ends[link], link_radii[link] = _around(ends[own], radii[own])
         middle = link_ends[link].mean(axis=0)
-        for b in on_it:
-            reaches[b] = np.linalg.norm(ends[b] - middle, axis=1).max() + radii[b]
-    members = np.argsort(links, kind="stable")
-    firsts = np.searchsorted(links[members], np.arange(count + 1))
-    link_reaches = np.linalg.norm(link_ends[:, 1] - link_ends[:, 0], axis=1) / 2 + link_radii
-    for indices in (members, firsts):
-        indices.setflags(write=False)
+        reaches[link] = (np.linalg.norm(ends[own] - middle, axis=2).max(axis=1) + radii[own]).max()
+    middles = link_ends.mean(axis=1)
+    firsts.setflags(write=False)
     return Bodies(
-        links, read_only(ends), read_only(radii), read_only(halves), read_only(rounding), read_only(reaches),
-        members, firsts, read_only(link_ends), read_only(link_radii), read_only(link_reaches),
-    )  # fmt: skip
+        read_only(ends - middles[links][:, None]), read_only(radii), read_only(halves), read_only(rounding), firsts,
+        read_only(link_ends - middles[:, None]), read_only(link_radii), read_only(reaches),
+    ), read_only(middles)  # fmt: skip
 
 
-def boxes_around(points: list[Array], first: int) -> Pieces:
-    """Boxes along the axes around the vertices (V, 3) of each piece; `first` is the number of the first one."""
+def boxes_around(points: list[Array], first: int) -> tuple[Pieces, Array]:
+    """Boxes along the axes around the vertices (V, 3) of each piece, and the middle (3,) of all in their frame (m).
+
+    Args:
+        points: Of each piece.
+        first: Number of the first one.
+    """
     low, high = np.array([p.min(axis=0) for p in points]), np.array([p.max(axis=0) for p in points])
+    middle = (low.min(axis=0) + high.max(axis=0)) / 2
+    low, high = low - middle, high - middle
     around = read_only([low.min(axis=0), high.max(axis=0)])
-    farthest = np.maximum(abs(low - around.mean(axis=0)), abs(high - around.mean(axis=0)))
-    return Pieces(read_only(low), read_only(high), around, read_only(np.linalg.norm(farthest, axis=1)), first)
+    return Pieces(read_only(low.T), read_only(high.T), around, first), read_only(middle)
 
 
 def bounding_capsule(shape: Any) -> tuple[Array, float]:
@@ -175,25 +172,58 @@ def lowest_corner(R, p, low, high, s):
     return z
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def segment_gap(R, p, ends, s, corners):
-    """Distance (m) of a box (2, 3) from the one along its axes around a segment on a link; −inf if they overlap."""
-    gap, one, other = 0.0, point_at(R, p, ends[0], s), point_at(R, p, ends[1], s)
-    for a in range(3):
-        d = max(corners[0, a] - max(one[a], other[a]), min(one[a], other[a]) - corners[1, a], 0.0)
-        gap += d * d
-    return np.sqrt(gap) if gap > 0.0 else -np.inf
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def segment_gap(pose, ends, corners):
+    """Distance (m) of a box (2, 3) from the one along its axes around a segment (2, 3); −inf if they overlap.
 
-
-@njit(cache=True, error_model="numpy", inline="always")
-def gap(low, high, s, other_low, other_high):
-    """Distance of two boxes along the axes, the first at sample s; −inf if they overlap."""
+    The pose (3, 4) is that of the segment's link as seen from the box.
+    """
     gap = 0.0
     for a in range(3):
-        d = max(other_low[a] - high[a, s], low[a, s] - other_high[a], 0.0)
+        one, other = pose[a, 3], pose[a, 3]
+        for b in range(3):
+            one += pose[a, b] * ends[0, b]
+            other += pose[a, b] * ends[1, b]
+        d = max(corners[0, a] - max(one, other), min(one, other) - corners[1, a], 0.0)
         gap += d * d
-    # How deep two bodies are in each other, overlapping boxes do not say.
     return np.sqrt(gap) if gap > 0.0 else -np.inf
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def write_box(pose, ends, halves, box):
+    """Write corners (2, 3) of the box along the axes around one given by half its edges (3, 3), seen from elsewhere.
+
+    Its centre is in the middle of `ends` (2, 3); the pose (3, 4) is that of its link.
+    """
+    for a in range(3):
+        middle, extent = pose[a, 3], 0.0
+        for b in range(3):
+            middle += pose[a, b] * (ends[0, b] + ends[1, b]) / 2
+            extent += abs(pose[a, 0] * halves[b, 0] + pose[a, 1] * halves[b, 1] + pose[a, 2] * halves[b, 2])
+        box[0, a], box[1, a] = middle - extent, middle + extent
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nnan", "nsz"})
+def squared_gaps(box, low, high, squared):
+    """Write the squared distances (P,) of a box (2, 3) from others along its axes, (3, P) each; returns the least (m²).
+
+    How deep two bodies are in each other, overlapping boxes do not say: their distance is 0.
+    """
+    for i in range(squared.size):
+        x = max(low[0, i] - box[1, 0], box[0, 0] - high[0, i], 0.0)
+        y = max(low[1, i] - box[1, 1], box[0, 1] - high[1, i], 0.0)
+        z = max(low[2, i] - box[1, 2], box[0, 2] - high[2, i], 0.0)
+        squared[i] = x * x + y * y + z * z
+    least = np.inf
+    for i in range(squared.size):
+        least = min(least, squared[i])
+    return least
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def gap_of(squared):
+    """Lower bound of a distance (m) whose boxes are apart by the root of this (m²)."""
+    return np.sqrt(squared) if squared > 0.0 else -np.inf
 
 
 @njit(cache=True, error_model="numpy", inline="always")

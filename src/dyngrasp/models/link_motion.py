@@ -1,6 +1,7 @@
-"""How links move, as it is seen from one frame: paths that bound what their bodies do from one sample to another.
+"""How links move: poses, and paths that bound what their bodies do from one sample to another.
 
-The index of the sample is the last of every array; the compiled functions take the arrays of one link.
+The index of the sample is the last of every array. The frame of a link is brought to the middle of what it carries
+first: no point of that is then farther from the origin than the link reaches.
 """
 
 from __future__ import annotations
@@ -17,51 +18,51 @@ STILL = 1e-9
 
 
 class Motion(NamedTuple):
-    """How F links move through S samples, seen from one frame.
-
-    A point that is ρ away from the middle of its link has covered `shift` + ρ `turn` since the first sample, at most.
+    """How F links move through S samples; the first is the world, the last one the part.
 
     Attributes:
         R: (F, 3, 3, S) rotations.
-        p: (F, 3, S) positions (m).
-        shift: (F, S) path of the middle of each link (m).
-        turn: (F, S) sum of 2 sin(θ/2) over the turns θ from sample to sample.
+        p: (F, 3, S) middles of what the links carry (m).
+        paths: (2, F, S) how far any point of what a link carries has moved since the first sample, and how much its
+            distance from any point of the part has changed, at most (m).
     """
 
     R: Array
     p: Array
-    shift: Array
-    turn: Array
-
-    def path(self, link: int, reach: float) -> Array:
-        """(S,) path of a body that extends by `reach` (m) from the middle of its link, at most (m)."""
-        return self.shift[link] + reach * self.turn[link]
+    paths: Array
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def follow(R, p, middles):
-    """`Motion` for poses of links (F, 3, 3, S), (F, 3, S) and the middles of their bodies (F, 3)."""
-    links, samples = p.shape[0], p.shape[2]
-    shift, turn = np.zeros((links, samples)), np.zeros((links, samples))
-    row = np.empty(samples)
-    for k in range(links):
+def to_middles(R, p, middles):
+    """Move the origins p (F, 3, S) of links with rotations R (F, 3, 3, S) to points (F, 3) in their frames (m)."""
+    for k in range(p.shape[0]):
         for a in range(3):
-            for s in range(samples):
-                row[s] = p[k, a, s] + R[k, a, 0, s] * middles[k, 0] + R[k, a, 1, s] * middles[k, 1] + (
-                    R[k, a, 2, s] * middles[k, 2]
-                )  # fmt: skip
-            _add_squared_steps(row, shift[k])
+            x, y, z, origin = R[k, a, 0], R[k, a, 1], R[k, a, 2], p[k, a]
+            for s in range(origin.size):
+                origin[s] += x[s] * middles[k, 0] + y[s] * middles[k, 1] + z[s] * middles[k, 2]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def paths_in_world(R, p, reaches, paths):
+    """Write the paths (F, S) of links (F, 3, 3, S), (F, 3, S) that reach so far (F,) from their origins (m).
+
+    A point at the distance r moves by |Δp| + r · 2 sin(θ/2) at most, if its link turns by θ.
+    """
+    shift, turn = np.empty(p.shape[2]), np.empty(p.shape[2])
+    # The world stays where it is.
+    paths[0] = 0.0
+    for k in range(1, p.shape[0]):
+        shift[:], turn[:] = 0.0, 0.0
+        for a in range(3):
+            _add_squared_steps(p[k, a], shift)
             for b in range(3):
-                _add_squared_steps(R[k, a, b], turn[k])
-        for s in range(samples):
+                _add_squared_steps(R[k, a, b], turn)
+        path = paths[k]
+        for s in range(path.size):
             # 2 sin(θ/2) is the Frobenius norm of the change over √2.
-            shift[k, s], turn[k, s] = np.sqrt(shift[k, s]), np.sqrt(turn[k, s] / 2)
-        path = angle = 0.0
-        for s in range(samples):
-            path += shift[k, s]
-            angle += turn[k, s]
-            shift[k, s], turn[k, s] = path, angle
-    return Motion(R, p, shift, turn)
+            path[s] = np.sqrt(shift[s]) + reaches[k] * np.sqrt(turn[s] / 2)
+        for s in range(1, path.size):
+            path[s] += path[s - 1]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
@@ -72,73 +73,59 @@ def _add_squared_steps(row, total):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def seen_from(R_view, p_view, R, p):
-    """Poses of links (F, 3, 3, S), (F, 3, S) as seen from a frame that moves too, (3, 3, S), (3, S)."""
-    turned, shifted = np.empty(R.shape), np.empty(p.shape)
-    samples = p.shape[2]
-    for k in range(R.shape[0]):
-        for a in range(3):
-            x, y, z = R_view[0, a], R_view[1, a], R_view[2, a]
-            for s in range(samples):
-                shifted[k, a, s] = (
-                    x[s] * (p[k, 0, s] - p_view[0, s])
-                    + y[s] * (p[k, 1, s] - p_view[1, s])
-                    + z[s] * (p[k, 2, s] - p_view[2, s])
-                )
-            for b in range(3):
-                for s in range(samples):
-                    turned[k, a, b, s] = x[s] * R[k, 0, b, s] + y[s] * R[k, 1, b, s] + z[s] * R[k, 2, b, s]
-    return turned, shifted
+def paths_from_part(paths, q, hand, levers, lifted, seen):
+    """Write how much distances (F, S) from the part, the last link, may change.
 
+    By the paths of link and part together. But from sample `lifted` on the part is fixed to the hand: what changes its
+    distance from a link of the hand are joints of the hand alone.
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def write_path(shift, turn, reach, path):
-    """Write (S,) how far (m) a body which extends by `reach` (m) from the middle of its link has moved, at most."""
-    for s in range(path.size):
-        path[s] = shift[s] + reach * turn[s]
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def paths_of(shift, turn, reaches):
-    """(F, S) paths (m) of links that extend by `reaches` (F,) from their middles (m)."""
-    paths = np.empty((reaches.size, shift.shape[1]))
-    for k in range(reaches.size):
-        write_path(shift[k], turn[k], reaches[k], paths[k])
-    return paths
+    Args:
+        paths: (F, S) of `paths_in_world`.
+        q: (n, S) of all joints (rad).
+        hand: (m,) which of them are the hand's.
+        levers: (F,) no point of a link of the hand is farther from any joint between it and the part (m); negative for
+            other links.
+        lifted: First sample at which the part is fixed to the hand.
+        seen: (F, S) to write in (m).
+    """
+    links, samples = paths.shape
+    turned = np.zeros(samples)
+    for i in hand:
+        for s in range(lifted + 1, samples):
+            turned[s] += abs(q[i, s] - q[i, s - 1])
+    for k in range(links - 1):
+        for s in range(samples):
+            seen[k, s] = paths[k, s] + paths[-1, s]
+        if levers[k] >= 0.0:
+            for s in range(lifted + 1, samples):
+                seen[k, s] = seen[k, s - 1] + levers[k] * turned[s]
+    seen[-1] = 0.0
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def next_beyond(path, s, stop, room):
-    """First sample after s, or `stop`, at which a path (S,), which never shrinks, is longer by more than `room` (m).
+def next_beyond(one, other, s, stop, room):
+    """First sample after s, or `stop`, at which two paths (S,) have grown by more than `room` (m) together.
 
-    While a body stays where it is, so does its distance: without room it must move for the next one to count.
+    While bodies stay where they are, so does their distance: without room one must move for the next sample to count.
     """
-    allowed = path[s] + max(room, STILL)
-    if path[stop - 1] <= allowed:
+    allowed = one[s] + other[s] + max(room, STILL)
+    if one[stop - 1] + other[stop - 1] <= allowed:
         return stop
     low, high = s + 1, stop - 1
     while low < high:
         middle = (low + high) // 2
-        if path[middle] <= allowed:
+        if one[middle] + other[middle] <= allowed:
             low = middle + 1
         else:
             high = middle
     return low
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def span(R, p, ends, halves, low, high, first, last):
-    """Corners (3, S) of the boxes along the axes around a box that a link carries, from one sample to another.
-
-    The box is given by half its edges (3, 3); its centre is in the middle of `ends` (2, 3).
-    """
-    x, y, z = (ends[0, 0] + ends[1, 0]) / 2, (ends[0, 1] + ends[1, 1]) / 2, (ends[0, 2] + ends[1, 2]) / 2
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def look_from(R_view, p_view, R, p, s, pose):
+    """Write the pose (3, 4) of a link (3, 3, S), (3, S) as seen from another one, at sample s."""
     for a in range(3):
-        X, Y, Z, origin = R[a, 0, first:last], R[a, 1, first:last], R[a, 2, first:last], p[a, first:last]
-        lowest, highest = low[a, first:last], high[a, first:last]
-        for s in range(origin.size):
-            extent = 0.0
-            for c in range(3):
-                extent += abs(X[s] * halves[c, 0] + Y[s] * halves[c, 1] + Z[s] * halves[c, 2])
-            middle = origin[s] + X[s] * x + Y[s] * y + Z[s] * z
-            lowest[s], highest[s] = middle - extent, middle + extent
+        x, y, z = R_view[0, a, s], R_view[1, a, s], R_view[2, a, s]
+        for b in range(3):
+            pose[a, b] = x * R[0, b, s] + y * R[1, b, s] + z * R[2, b, s]
+        pose[a, 3] = x * (p[0, s] - p_view[0, s]) + y * (p[1, s] - p_view[1, s]) + z * (p[2, s] - p_view[2, s])

@@ -18,7 +18,7 @@ from dyngrasp.planning.clearance import clearance_entries
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.part_motion import PartMotion, part_motion
-from dyngrasp.planning.plan_samples import at_grid_points, between, waypoints_of
+from dyngrasp.planning.plan_samples import at_grid_points, between
 from dyngrasp.planning.problem import AuditEntry, AuditReport
 from dyngrasp.planning.worst_values import ROWS, PlanModels, hand_in_grasp_frame, plan_models
 from dyngrasp.signals import Array
@@ -74,7 +74,7 @@ def audit(
             *_consistency(plan),
             *_boundaries(plan, targets, part, models, task.settings.pregrasp_distance, since),
             *_along(plan, part, models, since, wall),
-            *clearance_entries(task, targets, waypoints_of(plan, since)),
+            *clearance_entries(task, targets, plan, since),
         )
     )
 

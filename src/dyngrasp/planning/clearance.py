@@ -2,17 +2,17 @@
 
 The least distance over all pairs of bodies and all samples is found without measuring most of them: compiled lower
 bounds (`models.distance_bounds`) say which pair at which sample could be nearest, that one is measured exactly, and
-what it shows bounds the samples around it; it ends when no bound is below the least distance measured.
+what it shows bounds the samples around it; it ends when no bound is below the least distance measured. Hand and part
+are nearest when it is taken, part and ground when it is lifted: that is measured first, and whatever is farther at
+another time is left out.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from dyngrasp.models.distance_bounds import (
     Candidates,
@@ -22,17 +22,18 @@ from dyngrasp.models.distance_bounds import (
     add_pieces_near_ground,
     first_of,
     lowest,
-    nearest_pair,
     space_for,
     tighten,
 )
 from dyngrasp.models.link_motion import Motion
-from dyngrasp.planning.cell_geometry import WORLD, CellGeometry, cell_geometry
+from dyngrasp.planning.cell_geometry import CellGeometry, cell_geometry, motion_along
 from dyngrasp.planning.grasp_targets import GraspTargets
 from dyngrasp.planning.grasp_task import GraspTask
 from dyngrasp.planning.part_motion import part_motion
-from dyngrasp.planning.plan_samples import Waypoints
+from dyngrasp.planning.plan_samples import waypoints
 from dyngrasp.planning.problem import AuditEntry
+from dyngrasp.signals import Array
+from dyngrasp.trajectory import GraspPlan
 
 # Distances above this (m) are not measured: the audit asks for contact, not for the exact width of a gap that nobody
 # would call narrow.
@@ -41,167 +42,159 @@ HORIZON = 0.05
 # The part stands on the ground when it is lifted; its own pieces may reach this far below z = 0 by rounding (m).
 RESTING_TOLERANCE = 5e-4
 
-# Most plans have fewer pairs that come near; room for all there could be takes longer to come by than to look at them.
+# Most plans have fewer candidates; room for all there could be takes longer to come by than to look at them.
 _FEW = 128
 
 # Coal's iterations stop within this of the distance (m); bounds that are nearer to each other say nothing.
 RESOLUTION = 1e-6
 
-
-def clearance_entries(task: GraspTask, targets: GraspTargets, waypoints: Waypoints) -> list[AuditEntry]:
-    """Least distances along a plan: to the ground, to the part outside the intended contact, of the arm to itself.
-
-    Args:
-        task: Arm, gripper and part.
-        targets: Where the part stands and how it is taken.
-        waypoints: Samples of the plan.
-
-    Returns:
-        Entries "ground_clearance", "part_clearance", "self_clearance" and, for the carried part against ground and
-        arm, "carried_clearance"; distances above `HORIZON` are reported as `HORIZON`.
-    """
-    cell, times = cell_geometry(task, targets.grasp.name), waypoints.times
-    world, seen, finite = cell.motions(waypoints, part_motion(targets))
-    if finite:
-        found = _checked(cell, waypoints, world, seen)
-    else:
-        found = [(np.nan, 0, "a motion that is not finite")] * len(_CHECKS)
-    bounds = 0.0, 0.0, 0.0, -_sunk(task, targets)
-    return [
-        AuditEntry(name, distance, bound, True, tolerance, "m", float(times[k]), who)
-        for (name, tolerance), bound, (distance, k, who) in zip(_CHECKS, bounds, found, strict=True)
-    ]
-
-
-# Entries and their tolerances (m), in the order of `_checked`.
-_CHECKS = (
-    ("ground_clearance", 0.0),
-    ("part_clearance", 0.0),
-    ("self_clearance", 0.0),
-    ("carried_clearance", RESTING_TOLERANCE),
-)
-
+# Which of `Motion.paths`.
+_IN_WORLD, _FROM_PART = 0, 1
 
 # Least distance (m, negative for penetration), the sample at which it occurs, and whose it is.
 Nearest = tuple[float, int, str]
 
 
-def _checked(cell: CellGeometry, waypoints: Waypoints, world: Motion, seen: Motion) -> list[Nearest]:
-    """What each check finds, for motion as seen from the world and from the part.
+def clearance_entries(
+    task: GraspTask, targets: GraspTargets, plan: GraspPlan, since: float = -np.inf
+) -> list[AuditEntry]:
+    """Least distances along a plan: to the ground, to the part outside the intended contact, of the arm to itself.
 
-    `HORIZON`, the first sample and nobody if nothing comes nearer than that.
+    Args:
+        task: Arm, gripper and part.
+        targets: Where the part stands and how it is taken.
+        plan: Any plan.
+        since: What comes before this time (s) is not looked at.
+
+    Returns:
+        Entries "ground_clearance", "part_clearance", "self_clearance" and, for the carried part against ground and
+        arm, "carried_clearance"; distances above `HORIZON` are reported as `HORIZON`.
     """
-    closing, lifted = waypoints.closing, waypoints.lifted
-    windows = _windows(cell.bodies.links, cell.is_pad, cell.on_arm, closing, lifted, waypoints.times.size)
-    found, least, groups = _candidates(world, seen, cell.bodies, cell.pieces, cell.link_pairs, windows, lifted)
-    taken, ground, itself, lifted_part, arm_at_part = itertools.pairwise(groups)
-    search, nobody = Search(cell, world, found, least), (HORIZON, 0, "")
-    # When the part is taken the hand is nearer to it than on the way: what is farther then need not be looked at.
-    closest = search.nearest(taken, seen, nobody)
-    on_the_way, at = _candidates_at_part(seen, cell.bodies, cell.pieces, windows[1], closest[0])
-    carried = search.nearest(lifted_part, world, (HORIZON, lifted, ""))
+    cell = cell_geometry(task, targets.grasp.name)
+    times, closing, lifted, motion, sunk, finite, found, taken, hanging = _at_the_grasp(
+        *plan.arrays, since, part_motion(targets), task.grasp_object.underside, cell.rows, cell.kinematics,
+        cell.bodies, cell.pieces, cell.is_pad,
+    )  # fmt: skip
+    if finite:
+        part = _nearest(cell, motion, found, (0, taken), _FROM_PART, (HORIZON, 0, ""))
+        carried = _nearest(cell, motion, found, (taken, hanging), _IN_WORLD, (HORIZON, lifted, ""))
+        found, groups = _anywhere(
+            motion, closing, lifted, part[0] - RESOLUTION, carried[0] - RESOLUTION, cell.bodies, cell.pieces,
+            cell.link_pairs, cell.is_pad, cell.on_arm,
+        )  # fmt: skip
+        ground = itself = HORIZON, 0, ""
+        if groups[-1] > 0:
+            on_the_way, above, between, later, arm = itertools.pairwise(groups)
+            part = _nearest(cell, motion, found, on_the_way, _FROM_PART, part)
+            ground = _nearest(cell, motion, found, above, _IN_WORLD, ground)
+            itself = _nearest(cell, motion, found, between, _IN_WORLD, itself)
+            carried = _nearest(cell, motion, found, later, _IN_WORLD, carried)
+            carried = _nearest(cell, motion, found, arm, _FROM_PART, carried)
+    else:
+        ground = part = itself = carried = np.nan, 0, "a motion that is not finite"
     return [
-        search.nearest(ground, world, nobody),
-        Search(cell, world, on_the_way, at).nearest((0, at.size), seen, closest),
-        search.nearest(itself, world, nobody),
-        # The part hangs in the gripper only from the lift on.
-        search.nearest(arm_at_part, seen, carried),
+        _entry("ground_clearance", ground, 0.0, 0.0, times),
+        _entry("part_clearance", part, 0.0, 0.0, times),
+        _entry("self_clearance", itself, 0.0, 0.0, times),
+        # So deep as an estimate puts the standing part into the ground it may hang when it is lifted.
+        _entry("carried_clearance", carried, -sunk, RESTING_TOLERANCE, times),
     ]
 
 
-@njit(cache=True)
-def _windows(links, is_pad, on_arm, closing, lifted, samples):
-    """(3, B, 2) first sample at which each body counts against the part, and one after the last.
+def _entry(name: str, found: Nearest, bound: float, tolerance: float, times: Array) -> AuditEntry:
+    distance, k, who = found
+    return AuditEntry(name, distance, bound, True, tolerance, "m", float(times[k]), who)
 
-    When the part is taken; all the time until then and after it; the arm's, for a part that hangs.
+
+@njit(cache=True, error_model="numpy")
+def _at_the_grasp(arm, gripper, ends, since, part, underside, rows, kinematics, bodies, pieces, is_pad):
+    """How all moves, and what is near when the part is taken and lifted.
+
+    Returns:
+        Times (S,); the samples from which on the pads may touch the part and from which on it hangs; `Motion`; how far
+        an estimate puts the standing part into the ground (m); whether all is finite; pairs within `HORIZON`, hand and
+        part at the last sample before it hangs, part and ground at the next one; how many of the first kind; of both.
     """
-    windows, taken = np.empty((3, links.size, 2), np.int64), max(lifted - 1, 0)
-    for b in range(links.size):
-        # What does not move is where it is meant to be; the pads count until they close.
-        first, last = 0 if links[b] != WORLD else samples, closing if is_pad[b] else samples
-        windows[0, b] = max(first, taken), min(last, taken + 1)
-        windows[1, b] = first, last
-        windows[2, b] = lifted if on_arm[b] else samples, samples
+    times, q, closing, lifted = waypoints(arm, gripper, ends, since, rows)
+    motion, finite = motion_along(q, times, lifted, part, kinematics)
+    most = pieces.low.shape[1] * (bodies.radii.size + 1)
+    found, taken, hanging, last = space_for(most), 0, 0, max(lifted - 1, 0)
+    if finite:
+        windows = _until_closing(bodies, is_pad, closing, last, last + 1)
+        taken = add_near_pieces(motion, bodies, pieces, windows, HORIZON, found, 0)
+        hanging = add_pieces_near_ground(motion, pieces, (lifted, lifted + 1), HORIZON, found, taken)
+    return times, closing, lifted, motion, _sunk(part, underside), finite, first_of(found, hanging), taken, hanging
+
+
+@njit(cache=True, error_model="numpy")
+def _anywhere(motion, closing, lifted, near_part, near_ground, bodies, pieces, link_pairs, is_pad, on_arm):
+    """Pairs that may come near at any sample, and where those of each kind begin and the last ones end.
+
+    First hand and part within `near_part` (m), then arm and hand with the ground and with themselves within `HORIZON`,
+    then, within `near_ground` (m), the lifted part with the ground and with the arm.
+    """
+    samples, room = motion.p.shape[2], _FEW
+    on_the_way = _until_closing(bodies, is_pad, closing, 0, samples)
+    by_arm = np.full((on_arm.size, 2), samples)
+    for b in range(on_arm.size):
+        if on_arm[b]:
+            by_arm[b, 0] = lifted
+    while True:
+        found = space_for(room)
+        part = add_near_pieces(motion, bodies, pieces, on_the_way, near_part, found, 0)
+        ground = add_near_ground(motion, bodies, HORIZON, found, part)
+        itself = add_near_each_other(motion, bodies, link_pairs, HORIZON, found, ground)
+        hanging = add_pieces_near_ground(motion, pieces, (lifted, samples), near_ground, found, itself)
+        arm = add_near_pieces(motion, bodies, pieces, by_arm, near_ground, found, hanging)
+        if arm >= 0:
+            return first_of(found, arm), (0, part, ground, itself, hanging, arm)
+        room *= 8
+
+
+@njit(cache=True)
+def _until_closing(bodies, is_pad, closing, first, stop):
+    """(B, 2) samples from one to before another at which each body counts against the part; pads do until they close.
+
+    What does not move is where it is meant to be.
+    """
+    windows = np.empty((is_pad.size, 2), np.int64)
+    for b in range(is_pad.size):
+        windows[b, 0] = first if b >= bodies.firsts[1] else stop
+        windows[b, 1] = min(closing, stop) if is_pad[b] else stop
     return windows
 
 
 @njit(cache=True)
-def _candidates(world, seen, bodies, pieces, link_pairs, windows, lifted):
-    """Pairs within `HORIZON`, the lowest bound of each, and where the pairs of each kind begin and the last ones end.
-
-    First those of the hand and the part as it is taken, then of arm and hand with the ground, with themselves, of the
-    lifted part with the ground, with the arm.
-    """
-    samples, bodies_by_pieces = world.p.shape[2], bodies.radii.size * pieces.reaches.size
-    most = 2 * bodies_by_pieces + bodies.radii.size * (bodies.radii.size + 1) + pieces.reaches.size
-    for pairs in (_FEW, most):
-        found = space_for(pairs, pairs * samples)
-        taken = add_near_pieces(seen, bodies, pieces, windows[0], HORIZON, found, 0)
-        ground = add_near_ground(world, bodies, HORIZON, found, taken)
-        itself = add_near_each_other(world, bodies, link_pairs, HORIZON, found, ground)
-        lifted_part = add_pieces_near_ground(world, pieces, lifted, HORIZON, found, itself)
-        arm = add_near_pieces(seen, bodies, pieces, windows[2], HORIZON, found, lifted_part)
-        if arm >= 0:
-            break
-    found = first_of(found, arm)
-    return found, lowest(found.stops, found.bounds), (0, taken, ground, itself, lifted_part, arm)
+def _sunk(part, underside):
+    """How far the standing part (of `part_motion`) reaches into the ground with corners (C, 3) of its underside (m)."""
+    rotation, position = part[0], part[1]
+    deepest = 0.0
+    for corner in underside:
+        z = position[2] + rotation[2, 0] * corner[0] + rotation[2, 1] * corner[1] + rotation[2, 2] * corner[2]
+        deepest = max(deepest, -z)
+    return deepest
 
 
-@njit(cache=True)
-def _candidates_at_part(seen, bodies, pieces, window, horizon):
-    """Pairs of the hand and the part within a horizon (m), and the lowest bound of each."""
-    samples, count = seen.p.shape[2], 0
-    for pairs in (_FEW, bodies.radii.size * pieces.reaches.size):
-        found = space_for(pairs, pairs * samples)
-        count = add_near_pieces(seen, bodies, pieces, window, horizon, found, 0)
-        if count >= 0:
-            break
-    found = first_of(found, count)
-    return found, lowest(found.stops, found.bounds)
+def _nearest(
+    cell: CellGeometry, motion: Motion, found: Candidates, group: tuple[int, int], frame: int, best: Nearest
+) -> Nearest:
+    """The nearest of a group of pairs, or `best` if none comes nearer than that.
 
-
-@dataclass
-class Search:
-    """Exact distances of some pairs of bodies, nearest first; each that is measured raises the bounds of its pair.
-
-    Attributes:
+    Args:
         cell: The bodies.
-        world: Motion of their links as seen from the world.
-        found: Pairs and the bounds of their distances.
-        least: (K,) of `lowest`.
+        motion: Of their links.
+        found: Pairs; each that is measured raises the bounds of its neighbours.
+        group: The first that counts, and one after the last.
+        frame: Which of the paths bound how much their distances change.
+        best: What is known already.
     """
-
-    cell: CellGeometry
-    world: Motion
-    found: Candidates
-    least: NDArray[np.int64]
-
-    def nearest(self, group: tuple[int, int], motion: Motion, best: Nearest) -> Nearest:
-        """The nearest of the pairs from one to another, or `best` if none comes nearer than that.
-
-        Args:
-            group: First pair, and one after the last.
-            motion: What their bounds rest on.
-            best: What is known already.
-        """
-        cell, world, found, least = self.cell, self.world, self.found, self.least
-        while group[0] < group[1]:
-            pair, bound = nearest_pair(least, found.bounds, *group)
-            if bound >= best[0] - RESOLUTION:
-                break
-            i, j = found.pairs[pair].tolist()
-            k = int(found.samples[least[pair]])
-            distance = cell.distance(i, j, world.R, world.p, k)
-            if not distance >= best[0]:
-                best = distance, k, f"{cell.names[i]} and {cell.names[j]}"
-            own = slice(found.stops[pair], found.stops[pair + 1])
-            one, other = (motion.path(cell.links[body], cell.reaches[body]) for body in (i, j))
-            at = least[pair] - own.start
-            least[pair] = own.start + tighten(found.samples[own], found.bounds[own], one, other, at, distance)
+    if group[0] == group[1]:
         return best
-
-
-def _sunk(task: GraspTask, targets: GraspTargets) -> float:
-    """How far an estimate puts the standing part into the ground (m): so deep it may hang when it is lifted."""
-    T, corners = targets.T_world_object, task.grasp_object.underside
-    return max(0.0, -float((corners @ T.rotation[2] + T.translation[2]).min()))
+    paths, at = motion.paths[frame], lowest(found.bounds, group)
+    while found.bounds[at] < best[0] - RESOLUTION:
+        i, j, k = found.which[at].tolist()
+        distance = cell.distance(i, j, motion.R, motion.p, k)
+        if not distance >= best[0]:
+            best = distance, k, f"{cell.names[i]} and {cell.names[j]}"
+        at = tighten(found, group, at, distance, paths[cell.links[i]], paths[cell.links[j]])
+    return best

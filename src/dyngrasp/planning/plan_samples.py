@@ -32,20 +32,6 @@ class PlanSamples:
     stops: tuple[int, int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class Waypoints:
-    """Where a plan is looked at: times (S,) on its clock, arm (n, S) and gripper (m, S) positions.
-
-    From sample `closing` on the pads may touch the part, from `lifted` on it hangs in the gripper.
-    """
-
-    times: Array
-    q: Array
-    q_h: Array
-    closing: int
-    lifted: int
-
-
 def at_grid_points(plan: GraspPlan, since: float) -> PlanSamples:
     """The plan on its grids, and at `since`; on the finer one where arm and gripper have different grids."""
     return PlanSamples(*_on_grids(*plan.arrays, since))
@@ -54,11 +40,6 @@ def at_grid_points(plan: GraspPlan, since: float) -> PlanSamples:
 def between(plan: GraspPlan, grid: PlanSamples, suspects: NDArray[np.bool_]) -> PlanSamples:
     """Samples inside the intervals that begin at the marked ones (M,) of the samples `grid`."""
     return PlanSamples(*_inside(*plan.arrays, grid.times, grid.stops, suspects))
-
-
-def waypoints_of(plan: GraspPlan, since: float = -np.inf) -> Waypoints:
-    """Samples of a plan from `since` (s) on, `JOINT_STEP` or less apart, with both ends of each phase."""
-    return Waypoints(*_along_paths(*plan.arrays, since))
 
 
 @njit(cache=True, error_model="numpy")
@@ -104,16 +85,55 @@ def _inside(arm, gripper, ends, times, grid_stops, suspects):
 
 
 @njit(cache=True, error_model="numpy")
-def _along_paths(arm, gripper, ends, since):
-    """The attributes of `waypoints_of`."""
+def waypoints(arm, gripper, ends, since, rows):
+    """A plan where its paths are looked at: from `since` (s) on, `JOINT_STEP` or less apart, both ends of each phase.
+
+    Args:
+        arm: Trajectories of the arm in `GraspPlan.arrays`,
+        gripper: those of the gripper,
+        ends: and when the phases end (s).
+        since: s.
+        rows: (n,), (m,) where in an array the positions of each joint of arm and gripper go.
+
+    Returns:
+        Times (S,) on the plan's clock, positions (n + m, S), and two samples: from the first one on the pads may touch
+        the part, from the second on it hangs in the gripper.
+    """
     local, stops = np.empty(0), np.zeros(3, np.int64)
     for i in range(3):
         if since < ends[i]:
             steps = _steps(arm[i], gripper[i], max(since - (ends[i] - arm[i][0]), 0.0))
             local = np.concatenate((local, steps))
         stops[i] = local.size
-    times, q, q_h, _ = _states(arm, gripper, ends, local, stops)
-    return times, q[0], q_h[0], stops[0], stops[1]
+    times, q, start = np.empty(local.size), np.empty((rows[0].size + rows[1].size, local.size)), 0
+    for i in range(3):
+        own = slice(start, stops[i])
+        times[own] = ends[i] - arm[i][0] + local[own]
+        _write_positions(arm[i], local[own], rows[0], q[:, own])
+        _write_positions(gripper[i], local[own], rows[1], q[:, own])
+        start = stops[i]
+    return times, q, stops[0], stops[1]
+
+
+@njit(cache=True, error_model="numpy")
+def _write_positions(trajectory, times, rows, out):
+    """Write positions of joints, those of `interpolate`, at times (M,) into rows (n,) of an array (≥ n, M)."""
+    duration, position, velocity, acceleration = trajectory
+    N = position.shape[0] - 1
+    step = duration / N
+    for m in range(times.size):
+        scaled = min(max(times[m], 0.0), duration) / step
+        k = max(min(int(scaled), N - 1), 0)
+        s = scaled - k
+        if s == 0.0 or s == 1.0:
+            for i in range(rows.size):
+                out[rows[i], m] = position[k + int(s), i]
+            continue
+        by_rate, half, sixth = step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12)
+        for i in range(rows.size):
+            v_k = acceleration[k, i]
+            straight = position[k, i] + by_rate * velocity[k, i]
+            out[rows[i], m] = straight + half * v_k + sixth * (acceleration[k + 1, i] - v_k)
 
 
 @njit(cache=True, error_model="numpy")
