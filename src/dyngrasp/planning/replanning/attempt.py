@@ -46,7 +46,11 @@ class Attempt:
         self.audit_took = 0.0
         self.previous: GraspTargets | None = None
         self.splice = splice_time(plan, t + self.settings.budget)
-        self.state = plan.sample(self.splice)
+
+    @cached_property
+    def state(self) -> PlanSample:
+        """Of the running plan at the splice."""
+        return self.plan.sample(self.splice)
 
     def to_pose(self, previous: GraspTargets, estimate: PoseEstimate) -> ReplanResult:
         """See `Replanner.replan_to_pose`."""
@@ -313,7 +317,8 @@ class Attempt:
 
     def _moves(self, estimate: PoseEstimate) -> bool:
         # A slower part than this moves less than `settled` while the grasp time changes by a second.
-        return bool(np.abs(estimate.twist_world).max() > self.settings.settled)
+        settled = self.settings.settled
+        return any(abs(rate) > settled for rate in estimate.twist_world.tolist())
 
     def _late(self, budget: float) -> bool:
         return self.clock() - self.began > budget
