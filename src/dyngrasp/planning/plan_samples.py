@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import GraspPlan, interpolate
+from dyngrasp.trajectory import interpolate
 
 # Samples of an interval between two grid points in which a constraint could be broken: a velocity, quadratic in
 # between, is then seen to 1/256 of its height.
@@ -19,8 +18,7 @@ SUBSTEPS = 16
 JOINT_STEP = 0.015
 
 
-@dataclass(frozen=True, eq=False)
-class PlanSamples:
+class PlanSamples(NamedTuple):
     """A plan at some times: on its clock (M,), states of arm (3, n, M) and gripper (3, m, M).
 
     The three are position, velocity and acceleration; `stops` says where each of the three phases ends in M.
@@ -32,56 +30,68 @@ class PlanSamples:
     stops: tuple[int, int, int]
 
 
-def at_grid_points(plan: GraspPlan, since: float) -> PlanSamples:
-    """The plan on its grids, and at `since`; on the finer one where arm and gripper have different grids."""
-    return PlanSamples(*_on_grids(*plan.arrays, since))
-
-
-def between(plan: GraspPlan, grid: PlanSamples, suspects: NDArray[np.bool_]) -> PlanSamples:
-    """Samples inside the intervals that begin at the marked ones (M,) of the samples `grid`."""
-    return PlanSamples(*_inside(*plan.arrays, grid.times, grid.stops, suspects))
-
-
 @njit(cache=True, error_model="numpy")
-def _on_grids(arm, gripper, ends, since):
-    """The attributes of `at_grid_points`."""
-    most = 0
+def at_grid_points(arm, gripper, ends, since):
+    """`PlanSamples` on the grids of `GraspPlan.arrays`, and at `since` (s).
+
+    On the finer one where arm and gripper have different grids; none of what comes before `since`.
+    """
+    first, stops = np.zeros(3, np.int64), np.zeros(3, np.int64)
     for i in range(3):
-        most += max(arm[i][1].shape[0], gripper[i][1].shape[0]) + 1
-    local, stops, count = np.empty(most), np.zeros(3, np.int64), 0
-    for i in range(3):
-        duration, N = arm[i][0], max(arm[i][1].shape[0], gripper[i][1].shape[0]) - 1
-        begin = ends[i] - duration
+        points, step, past = _grid_of(arm[i], gripper[i], ends[i], since)
+        count = 0
         if since < ends[i]:
-            first = 0
-            if since > begin:
-                local[count] = since - begin
-                count += 1
-                while first <= N and first * (duration / N) <= since - begin:
-                    first += 1
-            for k in range(first, N):
-                local[count] = k * (duration / N)
-                count += 1
-            local[count] = duration
-            count += 1
-        stops[i] = count
-    return _states(arm, gripper, ends, local[:count], stops)
+            while past > 0.0 and first[i] < points - 1 and first[i] * step <= past:
+                first[i] += 1
+            count = points - first[i] + (past > 0.0)
+        stops[i] = count + (stops[i - 1] if i > 0 else 0)
+    samples = _room_for(arm, gripper, stops)
+    for i in range(3):
+        points, step, past = _grid_of(arm[i], gripper[i], ends[i], since)
+        start = stops[i - 1] if i > 0 else 0
+        if start == stops[i]:
+            continue
+        local = step * np.arange(points)
+        local[-1] = arm[i][0]
+        if past > 0.0:
+            _write_states(arm, gripper, ends, i, np.full(1, past), start, samples)
+            start += 1
+        if arm[i][1].shape[0] == points and gripper[i][1].shape[0] == points:
+            for trajectory, out in ((arm[i], samples.arm), (gripper[i], samples.gripper)):
+                for kind, values in enumerate(trajectory[1:]):
+                    out[kind, :, start : stops[i]] = values[first[i] :].T
+            samples.times[start : stops[i]] = ends[i] - arm[i][0] + local[first[i] :]
+        else:
+            _write_states(arm, gripper, ends, i, local[first[i] :], start, samples)
+    return samples
+
+
+@njit(cache=True, inline="always")
+def _grid_of(arm, gripper, end, since):
+    """Grid points of a phase, their distance (s), and how long before `since` it began (s)."""
+    points = max(arm[1].shape[0], gripper[1].shape[0])
+    return points, arm[0] / (points - 1), since - (end - arm[0])
 
 
 @njit(cache=True, error_model="numpy")
-def _inside(arm, gripper, ends, times, grid_stops, suspects):
-    """The attributes of `between`."""
+def between(arm, gripper, ends, grid, suspects):
+    """`PlanSamples` inside the intervals that begin at the marked ones (M,) of those at the grid points."""
     local, stops = np.empty(SUBSTEPS * suspects.sum()), np.zeros(3, np.int64)
     count = start = 0
     for i in range(3):
         begin = ends[i] - arm[i][0]
-        for k in range(start, grid_stops[i]):
+        for k in range(start, grid.stops[i]):
             if suspects[k]:
                 for part in range(1, SUBSTEPS):
-                    local[count] = times[k] - begin + part / SUBSTEPS * (times[k + 1] - times[k])
+                    local[count] = grid.times[k] - begin + part / SUBSTEPS * (grid.times[k + 1] - grid.times[k])
                     count += 1
-        start, stops[i] = grid_stops[i], count
-    return _states(arm, gripper, ends, local[:count], stops)
+        start, stops[i] = grid.stops[i], count
+    samples = _room_for(arm, gripper, stops)
+    start = 0
+    for i in range(3):
+        _write_states(arm, gripper, ends, i, local[start : stops[i]], start, samples)
+        start = stops[i]
+    return samples
 
 
 @njit(cache=True, error_model="numpy")
@@ -136,20 +146,20 @@ def _write_positions(trajectory, times, rows, out):
             out[rows[i], m] = straight + half * v_k + sixth * (acceleration[k + 1, i] - v_k)
 
 
+@njit(cache=True)
+def _room_for(arm, gripper, stops):
+    """`PlanSamples` to be written."""
+    n, m, size = arm[0][1].shape[1], gripper[0][1].shape[1], stops[2]
+    return PlanSamples(np.empty(size), np.empty((3, n, size)), np.empty((3, m, size)), (stops[0], stops[1], stops[2]))
+
+
 @njit(cache=True, error_model="numpy")
-def _states(arm, gripper, ends, local, stops):
-    """Arrays of `PlanSamples` at times of each phase, counted from its beginning (s)."""
-    times = np.empty(local.size)
-    both = np.empty((3, arm[0][1].shape[1], local.size)), np.empty((3, gripper[0][1].shape[1], local.size))
-    start = 0
-    for i in range(3):
-        stop = stops[i]
-        for k in range(start, stop):
-            times[k] = ends[i] - arm[i][0] + local[k]
-        for trajectory, out in ((arm[i], both[0]), (gripper[i], both[1])):
-            interpolate(trajectory, local[start:stop], out[:, :, start:stop].transpose(0, 2, 1))
-        start = stop
-    return times, both[0], both[1], (stops[0], stops[1], stops[2])
+def _write_states(arm, gripper, ends, i, local, start, samples):
+    """Write samples of a phase, from `start` on, at times counted from its beginning (s)."""
+    stop = start + local.size
+    samples.times[start:stop] = ends[i] - arm[i][0] + local
+    for trajectory, out in ((arm[i], samples.arm), (gripper[i], samples.gripper)):
+        interpolate(trajectory, local, out[:, :, start:stop].transpose(0, 2, 1))
 
 
 @njit(cache=True, error_model="numpy")

@@ -2,228 +2,147 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from numba import njit
-from numpy.typing import NDArray
 
-from dyngrasp.models.assembly import assemble
 from dyngrasp.models.batch_dynamics import (
-    Attachments,
-    BatchModel,
     compose,
     frame_poses,
-    joint_torques,
-    link_wrenches,
-    newton,
+    newton_euler,
     side_by_side,
+    wrench_along,
 )
-from dyngrasp.models.kinematic_tree import frames_named
-from dyngrasp.models.pinch import Pinch, pad_loads
-from dyngrasp.planning.grasp_task import GraspTask
-from dyngrasp.planning.part_motion import PartMotion, part_poses
-from dyngrasp.planning.plan_samples import PlanSamples
-from dyngrasp.signals import Array, read_only
+from dyngrasp.models.pinch import pad_loads
+from dyngrasp.planning.audit_rows import ARM, AXIS, DIP, FUNNEL, GRIPPER, HOLD, TILT, TORQUE, enter
+from dyngrasp.planning.part_motion import part_poses
 from dyngrasp.trajectory import largest
 
 # A function of the motion departs from the chord between two grid points by about an eighth of its second difference
 # there. An interval in which four times that could break a constraint is suspect.
 CURVATURE_FACTOR = 4.0 / 8.0
 
-# Rows of the table of worst values: name, whether the bound is a lower one, and whose joints it is about.
-ROWS = (
-    ("position", False, "arm_joints"),
-    ("velocity", False, "arm_joints"),
-    ("acceleration", False, "arm_joints"),
-    ("gripper_position", False, "gripper_joints"),
-    ("gripper_velocity", False, "gripper_joints"),
-    ("gripper_acceleration", False, "gripper_joints"),
-    ("torque", False, "arm_joints"),
-    ("funnel", True, ""),
-    ("grasp_axis", False, ""),
-    ("grasp_dip", True, ""),
-    ("grasp_tilt", False, ""),
-    ("hold", False, ""),
-)
-GRIPPER, TORQUE, FUNNEL, AXIS, DIP, TILT, HOLD = 3, 6, 7, 8, 9, 10, 11
-
 _pad_loads = njit(cache=True)(pad_loads)
 
 
-class PlanModels:
-    """What does not change from plan to plan: arrays of the arm empty and loaded, frames of the hand, limits.
-
-    Args:
-        task: Arm, gripper, part and settings.
-        grasp_name: How the part is taken.
+class Wall(NamedTuple):
+    """What part of its height the wall of the funnel has: more and more of it where a motion begins outside.
 
     Attributes:
-        bounds: (12,) of `ROWS`.
-        hand: Where the joints of arm and hand are in their tree; the tree; a frame of the hand, turned like the grasp,
-            and those of both pads.
-        grasp_on_part: Rotation (3, 3) and position (3,) of the grasp frame in the part's.
+        factor: At the begin.
+        low, high: Shares of the duration until which it stays there, and at which the wall is whole.
+        begin: When the motion begins (s).
+        duration: s.
     """
 
-    def __init__(self, task: GraspTask, grasp_name: str) -> None:
-        grasp = next(grasp for grasp in task.grasp_object.grasps if grasp.name == grasp_name)
-        robot, part, settings, gripper = task.robot, task.grasp_object, task.settings, task.gripper
-        loaded = BatchModel.from_pinocchio(task.robot_loaded(grasp).loaded_model)
-        self._empty = BatchModel.from_pinocchio(task.robot_empty.loaded_model).chain
-        # What the hand carries changes the inertia of the last link and nothing else.
-        self._loaded = float(loaded.mass[-1]), loaded.first_moment[-1], loaded.inertia[-1]
-        assembly = assemble(robot, gripper)
-        tree = BatchModel.from_pinocchio(assembly.pin_model)
-        frames = self._frames(tree, assembly.pin_model, assembly.flange_id, task)
-        self.hand = assembly.arm_indices, assembly.hand_indices, tree.tree, frames.arrays
-        self.grasp_on_part = read_only(grasp.T_object_grasp.rotation), read_only(grasp.T_object_grasp.translation)
-        held = loaded.attach([(robot.n, robot.T_last_flange * task.T_flange_closed(grasp))])
-        T_link_held = pin.SE3(held.rotations[0], held.positions[0])
-        body = (T_link_held * grasp.T_object_grasp.inverse()).act(part.spatial_inertia)
-        self._held = (
-            float(body.mass), read_only(body.mass * body.lever), read_only(body.matrix()[3:, 3:]),
-            held.rotations[0], held.positions[0], Pinch(*(float(x) for x in task.pinch(grasp))),
-        )  # fmt: skip
-        limits = robot.limits
-        self._limits = (
-            _boxes(limits.position_lower, limits.position_upper, limits.velocity, limits.acceleration),
-            _boxes(gripper.lower, gripper.upper, gripper.velocity, gripper.acceleration),
-            read_only(limits.torque),
-        )
-        funnel = part.funnel
-        self._funnel = float(funnel.sigma_x), float(funnel.sigma_y), float(funnel.z_threshold)
-        tolerances = settings.lateral_tolerance, -settings.dip_tolerance, settings.tilt_tolerance
-        self.bounds = read_only([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, *tolerances, 1.0])
-
-    def _frames(self, tree: BatchModel, model: pin.Model, flange_id: int, task: GraspTask) -> Attachments:
-        pads = (frames_named(model, name)[0] for name in task.gripper.pads)
-        frames = [model.frames[i] for i in (flange_id, *pads)]
-        (flange, T), *fingers = [(int(frame.parentJoint), pin.SE3(frame.placement)) for frame in frames]
-        # The axes of the pinch are those of the hand; only its origin depends on the fingers.
-        return tree.attach([(flange, T * task.T_flange_open), *fingers])
-
-    def worst_values(self, samples: PlanSamples, part: PartMotion, wall: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Evaluate all constraints.
-
-        Args:
-            samples: Of the plan.
-            part: Where the part is.
-            wall: What part of its height the wall of the funnel has at the samples of the approach.
-
-        Returns:
-            (12, 3), one of `ROWS` each: the worst value, its time (s) and joint, or −1 where there are no samples; (M,)
-            samples between which and the next one a constraint could be broken.
-        """
-        return _worst_values(
-            samples.times, samples.arm, samples.gripper, samples.stops, wall, part, self.grasp_on_part,
-            self._limits, self._empty, self._loaded, self.hand,
-            self._held, self._funnel, self.bounds,
-        )  # fmt: skip
+    factor: float
+    low: float
+    high: float
+    begin: float
+    duration: float
 
 
-@lru_cache(maxsize=8)
-def plan_models(task: GraspTask, grasp_name: str) -> PlanModels:
-    """The models of a task, made once."""
-    return PlanModels(task, grasp_name)
-
-
-def _boxes(lower: Array, upper: Array, velocity: Array, acceleration: Array) -> tuple[Array, Array]:
-    """Middles and half-widths (3, n) of the ranges of position, velocity and acceleration."""
-    zero = np.zeros_like(velocity)
-    return read_only([(upper + lower) / 2, zero, zero]), read_only([(upper - lower) / 2, velocity, acceleration])
+WHOLE = Wall(1.0, 0.0, 1.0, 0.0, 1.0)
 
 
 @njit(cache=True, error_model="numpy")
-def _worst_values(
-    times, arm, gripper, stops, wall, part, grasp_on_part, limits, empty, loaded, hand, held, funnel, bounds
-):
-    """See `PlanModels.worst_values`; `loaded` is the last link from the lift on."""
-    closing, lifted, last = stops
-    table, suspects = np.full((len(ROWS), 3), -1.0), np.zeros(last, dtype=np.bool_)
-    _limits(arm, limits[0], times, table[:GRIPPER], suspects)
-    _limits(gripper, limits[1], times, table[GRIPPER:TORQUE], suspects)
+def enter_worst_values(samples, part, wall, models, table):
+    """Enter the worst values of all constraints along a plan into a table of `ROWS`.
+
+    Args:
+        samples: `PlanSamples`.
+        part: Where the part is, of `part_motion`.
+        wall: `Wall`.
+        models: `PlanModels`.
+        table: Of `empty_table`, or with what other samples entered.
+
+    Returns:
+        (M,) samples between which and the next one a constraint could be broken.
+    """
+    times, arm, gripper, (closing, lifted, last) = samples
+    suspects = np.zeros(last, dtype=np.bool_)
+    _enter_limits(arm, models.arm_boxes, times, table[ARM:], suspects)
+    _enter_limits(gripper, models.gripper_boxes, times, table[GRIPPER:], suspects)
     if lifted:
-        arm_indices, hand_indices, tree, frames = hand
-        both = side_by_side(arm[0, :, :lifted], gripper[0, :, :lifted], arm_indices, hand_indices)
-        R, p = frame_poses(both, tree, frames)
-        _grasp_frame(R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects)
-    wrenches, motion = link_wrenches(arm[0], arm[1], arm[2], empty)
-    if last > lifted:
-        mass, first_moment, inertia = loaded
-        carrying, wrench = motion[:, lifted:].copy(), np.empty((6, last - lifted))
-        newton(mass, first_moment, inertia, carrying, wrench)
-        wrenches[-1, :, lifted:] = wrench
-        _hold(carrying, held, times, lifted, table[HOLD], suspects)
-    torque = joint_torques(arm[0], arm[2], wrenches, empty)
-    share = _shares(torque, np.zeros(limits[2].size), limits[2])
-    _judge(share, 0, 1.0, 1.0, times, table[TORQUE], suspects)
+        hand = models.hand
+        both = side_by_side(arm[0, :, :lifted], gripper[0, :, :lifted], hand.arm_indices, hand.hand_indices)
+        R, p = frame_poses(both, hand.tree, hand.frames)
+        G, angle = hand_in_grasp_frame(R, p, times[:lifted], part, models.grasp_on_part)
+        _enter_funnel(G[:, :closing], wall, models.funnel, times, table[FUNNEL], suspects)
+        _enter_closing(G, angle, closing, models.bounds, times, table, suspects)
+    carries = np.zeros(last)
+    carries[lifted:] = 1.0
+    torque, motion = newton_euler(arm[0], arm[1], arm[2], models.empty, models.carried, carries)
+    _enter_shares(torque, np.zeros(models.torque.size), models.torque, True, times, table[TORQUE], suspects)
+    _judge(_grip_shares(motion[:, lifted:], models.held), 1.0, 1.0, times[lifted:], table[HOLD], suspects[lifted:])
     # What follows the last sample of a phase is a join: no time passes there.
-    for stop in stops:
+    for stop in (closing, lifted, last):
         if stop > 0:
             suspects[stop - 1] = False
-    return table, suspects
+    return suspects
 
 
 @njit(cache=True, error_model="numpy")
-def _limits(states, boxes, times, table, suspects):
-    """Positions, velocities and accelerations (3, n, M) within `_boxes`, as parts of their half-widths."""
+def _enter_limits(states, boxes, times, rows, suspects):
+    """Positions, velocities and accelerations (3, n, M) within boxes, as parts of their half-widths."""
     middles, limits = boxes
     for kind in range(3):
-        share = _shares(states[kind], middles[kind], limits[kind])
-        if kind < 2:
-            _judge(share, 0, 1.0, 1.0, times, table[kind], suspects)
-        else:
-            # Between two grid points accelerations are linear: no worse than there.
-            _enter(share, 0, 1.0, times, table[kind])
+        # Between two grid points accelerations are linear: no worse than there.
+        _enter_shares(states[kind], middles[kind], limits[kind], kind < 2, times, rows[kind], suspects)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _shares(values, middles, limits):
-    """Values (n, M) less their middles (n,) as parts of their limits (n,)."""
-    share = np.empty(values.shape)
+def _enter_shares(values, middles, limits, bends, times, row, suspects):
+    """Values (n, M) less their middles (n,) as parts of their limits (n,); whether they bend between the samples."""
+    share = np.empty(values.shape[1])
     for i in range(limits.size):
         middle, inverse = middles[i], 1.0 / limits[i]
-        for k in range(values.shape[1]):
-            share[i, k] = abs(values[i, k] - middle) * inverse
-    return share
+        for k in range(share.size):
+            share[k] = abs(values[i, k] - middle) * inverse
+        most = largest(share)
+        if row[2] < 0.0 or not most <= row[0]:
+            enter(row, 1.0, most, times[_first_at(share, most)], i)
+        # Between zero and the largest no second difference exceeds twice that. Most rows are far from their bounds
+        # everywhere; a NaN is not.
+        if bends and not 1.0 - most >= CURVATURE_FACTOR * 2.0 * most:
+            _mark_suspects(share, 1.0, 1.0, suspects)
 
 
 @njit(cache=True, error_model="numpy")
-def _grasp_frame(R, p, part, grasp_on_part, times, wall, funnel, bounds, closing, table, suspects):
-    """What the hand (3, 3, 3, M), (3, 3, M) does above and at the grasp frame, in approach and grasp.
-
-    In the approach h(q) of eq. (6), how high G is above the inverted Gaussian of eq. (5) times `wall`. In the grasp G
-    stays on the grasp axis, does not pass far below the grasp frame, and the hand does not turn as it closes.
-    """
-    samples, (sigma_x, sigma_y, threshold) = p.shape[2], funnel
-    G, angle = hand_in_grasp_frame(R, p, part, grasp_on_part, times[:samples])
-    height, above = np.empty((1, closing)), np.empty((1, samples - closing))
-    aside, tilt = np.empty(above.shape), np.empty(above.shape)
-    for s in range(closing):
+def _enter_funnel(G, wall, funnel, times, row, suspects):
+    """Height h(q) of G (3, M), eq. (6), above the inverted Gaussian of eq. (5) times what there is of the wall."""
+    (sigma_x, sigma_y, threshold), height = funnel, np.empty(G.shape[1])
+    for s in range(height.size):
+        share = ((times[s] - wall.begin) / wall.duration - wall.low) / (wall.high - wall.low)
+        risen = wall.factor + (1.0 - wall.factor) * min(max(share, 0.0), 1.0)
         bell = np.exp(-0.5 * ((G[0, s] / sigma_x) ** 2 + (G[1, s] / sigma_y) ** 2))
-        height[0, s] = G[2, s] - wall[s] * threshold * (1.0 - bell)
-    for s in range(closing, samples):
-        aside[0, s - closing] = np.sqrt(G[0, s] ** 2 + G[1, s] ** 2)
-        above[0, s - closing], tilt[0, s - closing] = G[2, s], angle[s]
-    if closing > 0:
-        _judge(height, 0, bounds[FUNNEL], -1.0, times, table[FUNNEL], suspects)
-    if samples > closing:
-        _judge(aside, closing, bounds[AXIS], 1.0, times, table[AXIS], suspects)
-        _judge(above, closing, bounds[DIP], -1.0, times, table[DIP], suspects)
-        _judge(tilt, closing, bounds[TILT], 1.0, times, table[TILT], suspects)
+        height[s] = G[2, s] - risen * threshold * (1.0 - bell)
+    _judge(height, 0.0, -1.0, times, row, suspects)
+
+
+@njit(cache=True, error_model="numpy")
+def _enter_closing(G, angle, closing, bounds, times, table, suspects):
+    """While the hand closes G stays on the grasp axis and not far below the frame, and the hand does not turn."""
+    aside = np.empty(angle.size - closing)
+    for s in range(aside.size):
+        aside[s] = np.sqrt(G[0, closing + s] ** 2 + G[1, closing + s] ** 2)
+    times, suspects = times[closing:], suspects[closing:]
+    _judge(aside, bounds[AXIS], 1.0, times, table[AXIS], suspects)
+    _judge(G[2, closing:], bounds[DIP], -1.0, times, table[DIP], suspects)
+    _judge(angle[closing:], bounds[TILT], 1.0, times, table[TILT], suspects)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def hand_in_grasp_frame(R, p, part, grasp_on_part, times):
-    """The hand as seen from the grasp frame where the part is at times (M,).
+def hand_in_grasp_frame(R, p, times, part, grasp_on_part):
+    """The hand as seen from the grasp frame where the part is.
 
     Args:
         R: (3, 3, 3, ≥ M) frames of the hand and both pads.
         p: (3, 3, ≥ M) m.
-        part: Of `part_motion`.
-        grasp_on_part: Rotation (3, 3) and position (3,) (m) of the grasp frame in the part's.
         times: (M,) s.
+        part: Of `part_motion`.
+        grasp_on_part: The grasp frame in the part's.
 
     Returns:
         G (3, M), and the angle of the hand against the frame (M,); from the difference of both rotations, which is
@@ -239,26 +158,33 @@ def hand_in_grasp_frame(R, p, part, grasp_on_part, times):
         x = (p[1, 0, s] + p[2, 0, s]) / 2 - p_grasp[0, s]
         y = (p[1, 1, s] + p[2, 1, s]) / 2 - p_grasp[1, s]
         z = (p[1, 2, s] + p[2, 2, s]) / 2 - p_grasp[2, s]
-        chord = 0.0
         for a in range(3):
             G[a, s] = R_grasp[0, a, s] * x + R_grasp[1, a, s] * y + R_grasp[2, a, s] * z
-            for b in range(3):
-                chord += (R[0, a, b, s] - R_grasp[a, b, s]) ** 2
-        angle[s] = 2.0 * np.arcsin(min(np.sqrt(chord / 8.0), 1.0))
+    write_angles(R[0], R_grasp, angle)
     return G, angle
 
 
-@njit(cache=True, error_model="numpy")
-def _hold(motion, held, times, first, row, suspects):
-    """Share of its friction that the busier pad needs to carry the part, velocity terms included.
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def write_angles(R, R_other, angle):
+    """Write the angles (M,) (rad) between rotations (3, 3, M), exact near zero."""
+    for s in range(angle.size):
+        chord = 0.0
+        for a in range(3):
+            for b in range(3):
+                chord += (R[a, b, s] - R_other[a, b, s]) ** 2
+        angle[s] = 2.0 * np.arcsin(min(np.sqrt(chord / 8.0), 1.0))
 
-    The safety factor of the planner is not applied here: at 1 the part would just slip. The part is given in the frame
-    of the last link, like its `motion` (9, M), and so is the grasp frame.
+
+@njit(cache=True, error_model="numpy")
+def _grip_shares(motion, held):
+    """Share of its friction (M,) that the busier pad needs to carry the part, velocity terms included.
+
+    The safety factor of the planner is not applied here: at 1 the part would just slip. `motion` (9, M) is that of the
+    link that carries the part.
     """
-    (mass, first_moment, inertia, R, p, pinch), samples = held, motion.shape[1]
-    wrench, share = np.empty((6, samples)), np.empty((1, samples))
-    newton(mass, first_moment, inertia, motion, wrench)
-    for s in range(samples):
+    (R, p), share = held.grasp, np.empty(motion.shape[1])
+    wrench = wrench_along(motion.copy(), held.mass, held.first_moment, held.inertia)
+    for s in range(share.size):
         fx, fy, fz = wrench[0, s], wrench[1, s], wrench[2, s]
         # The moment about the grasp point.
         mx = wrench[3, s] - (p[1] * fz - p[2] * fy)
@@ -274,76 +200,44 @@ def _hold(motion, held, times, first, row, suspects):
             R[0, 1] * mx + R[1, 1] * my + R[2, 1] * mz,
             R[0, 2] * mx + R[1, 2] * my + R[2, 2] * mz,
         )
-        (load, normal), (other_load, other_normal) = _pad_loads(force, moment, pinch)
+        (load, normal), (other_load, other_normal) = _pad_loads(force, moment, held.pinch)
         one, other = np.sqrt(load) / max(normal, 1e-9), np.sqrt(other_load) / max(other_normal, 1e-9)
-        share[0, s] = one if not one <= other else other
-    _judge(share, first, 1.0, 1.0, times, row, suspects)
+        share[s] = one if not one <= other else other
+    return share
 
 
 @njit(cache=True, error_model="numpy")
-def _judge(values, first, bound, sign, times, row, suspects):
-    """Enter the worst of values (k, m), at the samples from `first` on, and where a bound could be broken in between.
+def _judge(values, bound, sign, times, row, suspects):
+    """Enter the worst of values (M,), and mark where a bound could be broken between two of them.
 
-    For `sign` 1 they must not exceed the bound, for −1 not fall below it.
+    For `sign` 1 they must not exceed the bound, for −1 not fall below it. Nothing is entered where there are none.
     """
-    highest = _enter(values, first, sign, times, row)
-    for j in range(values.shape[0]):
-        # Most rows are far from their bounds everywhere: a NaN is not, nor is a bound that is one.
-        slack = sign * bound - highest[j]
-        if slack != slack or not slack >= CURVATURE_FACTOR * _largest_bend(values[j]):
-            _mark_suspects(values[j], bound, sign, suspects[first : first + values.shape[1]])
+    if values.size > 0:
+        worst = 0
+        for s in range(values.size):
+            if not sign * values[s] <= sign * values[worst] and values[worst] == values[worst]:
+                worst = s
+        enter(row, sign, values[worst], times[worst], 0)
+        _mark_suspects(values, bound, sign, suspects)
 
 
-@njit(cache=True, error_model="numpy")
-def _enter(values, first, sign, times, row):
-    """The worst of values (k, m), its time and which of the k it is; the first NaN, if there is one.
-
-    Returns:
-        (k,) largest of each times `sign`; NaN if there is one.
-    """
-    worst, which, highest, signed = -np.inf, 0, np.empty(values.shape[0]), np.empty(values.shape[1])
-    for j in range(values.shape[0]):
-        for k in range(signed.size):
-            signed[k] = sign * values[j, k]
-        total = _total(signed)
-        highest[j] = largest(signed) if total == total else np.nan
-        if not highest[j] <= worst and worst == worst:
-            worst, which = highest[j], j
-    at = 0
-    for k in range(values.shape[1] - 1, -1, -1):
-        if sign * values[which, k] == worst or (worst != worst and values[which, k] != values[which, k]):
-            at = k
-    row[0], row[1], row[2] = values[which, at], times[first + at], which
-    return highest
-
-
-@njit(cache=True, fastmath={"reassoc"})
-def _total(row):
-    """Sum of absolute values, in any order; NaN if one of them is."""
-    total = 0.0
-    for k in range(row.size):
-        total += abs(row[k])
-    return total
-
-
-@njit(cache=True, error_model="numpy")
-def _largest_bend(row):
-    """Largest second difference of a row; NaN if there is one."""
-    bends = np.zeros(max(row.size - 2, 1))
-    for k in range(row.size - 2):
-        bends[k] = abs(row[k] - 2.0 * row[k + 1] + row[k + 2])
-    return largest(bends)
+@njit(cache=True)
+def _first_at(values, wanted):
+    """Index of the first of the values (M,) that is the wanted one; NaN is NaN."""
+    s = 0
+    while values[s] != wanted and not (wanted != wanted and values[s] != values[s]):
+        s += 1
+    return s
 
 
 @njit(cache=True, error_model="numpy")
 def _mark_suspects(row, bound, sign, suspects):
     """Mark the intervals between samples of a row (m,) in which the bound is not farther than it may bend."""
-    last = row.size - 1
+    last, before = row.size - 1, 0.0
     for k in range(last):
-        bend = abs(row[k - 1] - 2.0 * row[k] + row[k + 1]) if k > 0 else 0.0
-        if k + 2 <= last:
-            bend = max(bend, abs(row[k] - 2.0 * row[k + 1] + row[k + 2]))
+        after = abs(row[k] - 2.0 * row[k + 1] + row[k + 2]) if k + 2 <= last else 0.0
         slack = min(sign * (bound - row[k]), sign * (bound - row[k + 1]))
         # A NaN is suspect as well.
-        if not slack >= CURVATURE_FACTOR * bend:
+        if not slack >= CURVATURE_FACTOR * max(before, after):
             suspects[k] = True
+        before = after

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dyngrasp.lanes import whole_lanes
 from dyngrasp.planning.replanning.joint_splines import (
     factorise,
     filtered,
@@ -14,7 +15,6 @@ from dyngrasp.planning.replanning.joint_splines import (
     substitute_both,
     unknowns_of,
 )
-from dyngrasp.planning.replanning.lanes import whole_lanes
 
 RNG = np.random.default_rng(0)
 

@@ -18,6 +18,7 @@ from dyngrasp.planning.replanning.outcome import Path, ReplannerSettings, Replan
 from dyngrasp.planning.replanning.phase_programs import APPROACH, DELIVER, GRASP
 from dyngrasp.planning.replanning.splice import Candidate, splice_time, track
 from dyngrasp.planning.replanning.target_update import target_updater
+from dyngrasp.planning.worst_values import WHOLE
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, PlanSample
 
@@ -187,12 +188,11 @@ class Attempt:
 
     def _audited(self, plan: GraspPlan, targets: GraspTargets) -> AuditReport:
         started, started_clock = time.perf_counter(), self.clock()
-        if self.recovery is None or self.recovery.factor >= 1.0:
-            report = audit(plan, targets, self.task, self.splice)
-        else:
-            report = audit(plan, targets, self.task, self.splice, self.recovery.wall(plan))
-        if self._keeps_moving:
-            report = AuditReport((*report.entries, standstill(plan, self.task, self.splice)))
+        wall = WHOLE if self.recovery is None else self.recovery.wall(plan)
+        report = audit(plan, targets, self.task, self.splice, wall)
+        slowest = standstill(plan, self.task, self.splice)
+        if slowest.ok or self._keeps_moving:
+            report = AuditReport((*report.entries, slowest))
         self._count("audit", started)
         self.audit_took = self.clock() - started_clock
         return report

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from dyngrasp.lanes import LANES, any_below, lanes_of, load
 from dyngrasp.planning.replanning.joint_splines import TAPS, Indices
-from dyngrasp.planning.replanning.lanes import LANES, any_below, lanes_of, load
 from dyngrasp.signals import Array
 
 # Beyond this a bound is none (rad, rad/s, rad/s²): nothing that moves in a cell comes near it.

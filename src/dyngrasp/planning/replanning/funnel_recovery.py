@@ -15,7 +15,6 @@ the audit's clearances to say.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +25,7 @@ from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.part_motion import part_poses
 from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.planning.replanning.target_update import target_updater
+from dyngrasp.planning.worst_values import Wall
 from dyngrasp.signals import Array
 from dyngrasp.trajectory import GraspPlan, interpolate
 
@@ -64,9 +64,9 @@ class FunnelRecovery:
         parameters[:, _HEIGHT_PARAMETER] *= self.at(np.linspace(0.0, 1.0, len(parameters)))
         return replace(constraint, parameters=parameters, lower=np.array([_MARGIN]))
 
-    def wall(self, plan: GraspPlan) -> Callable[[Array], Array]:
-        """φ at times (s) of the approach of a plan that begins at the splice."""
-        return lambda times: self.at((times - plan.start_time) / plan.arm[0].duration)
+    def wall(self, plan: GraspPlan) -> Wall:
+        """φ over the approach of a plan that begins at the splice."""
+        return Wall(self.factor, *self.shares, plan.start_time, plan.arm[0].duration)
 
 
 def funnel_recovery(

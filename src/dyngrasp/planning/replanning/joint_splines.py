@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from dyngrasp.planning.replanning.lanes import LANES, lanes_of, load, store
+from dyngrasp.lanes import LANES, lanes_of, load, store
 from dyngrasp.signals import Array
 
 Indices = NDArray[np.int64]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from dyngrasp.lanes import LANES, lanes_of, load, narrow, store, sum_of, whole_lanes, widen
 from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
 from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
@@ -27,7 +28,6 @@ from dyngrasp.planning.replanning.joint_splines import (
     unknowns_of,
     write,
 )
-from dyngrasp.planning.replanning.lanes import LANES, lanes_of, load, narrow, store, sum_of, whole_lanes, widen
 from dyngrasp.signals import Array
 
 # A row may be violated by this much of its half-width: a tenth of what the audit forgives as rounding.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from dyngrasp.planning.replanning.lanes import (
+from dyngrasp.lanes import (
     LANES,
     any_below,
     lanes_of,
