@@ -9,6 +9,7 @@ from dyngrasp.lanes import LANES, load, store
 from dyngrasp.models.assembly import assemble
 from dyngrasp.models.batch_dynamics import BatchModel, cosine_sine, wrench_on
 from dyngrasp.models.catalogue import load_robot
+from dyngrasp.models.newton_euler import newton_euler
 from dyngrasp.models.robot import read_robot
 
 M = 60
@@ -89,6 +90,17 @@ def test_wrench_is_what_a_body_on_the_flange_adds_at_the_last_joint(robot, paylo
         at_flange = T.actInv(pin.Force(wrench[:, k])).vector
         expected = loaded.inverse_dynamics(q, w, v) - bare[:, k]
         np.testing.assert_allclose(J.T @ at_flange, expected, rtol=0, atol=1e-11 * np.abs(bare).max())
+
+
+def test_a_body_on_the_last_link_counts_at_the_samples_that_have_it(robot, payload, motion):
+    bare, loaded = (BatchModel.from_pinocchio(one.loaded_model) for one in (robot, robot.with_payload(payload)))
+    more = [getattr(loaded, name)[-1] - getattr(bare, name)[-1] for name in ("mass", "first_moment", "inertia")]
+    # Full from a sample on that is none of the first of eight, and half of it at the last one.
+    share = np.concatenate([np.zeros(21), np.ones(M - 22), [0.5]])
+    torque, _ = newton_euler(*motion, bare.chain, (float(more[0]), more[1], more[2]), share)
+    without, whole = bare.inverse_dynamics(*motion)[0], loaded.inverse_dynamics(*motion)[0]
+    expected = without + share * (whole - without)
+    np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * np.abs(whole).max())
 
 
 def test_other_joints_are_refused():
