@@ -317,8 +317,7 @@ class Attempt:
 
     def _moves(self, estimate: PoseEstimate) -> bool:
         # A slower part than this moves less than `settled` while the grasp time changes by a second.
-        settled = self.settings.settled
-        return any(abs(rate) > settled for rate in estimate.twist_world.tolist())
+        return any(abs(rate) > self.settings.settled for rate in estimate.twist_world.tolist())
 
     def _late(self, budget: float) -> bool:
         return self.clock() - self.began > budget
@@ -346,15 +345,5 @@ class Attempt:
     def _result(self, status: Status, plan: GraspPlan, path: Path, targets: GraspTargets) -> ReplanResult:
         self.timings["total"] = 1e3 * (time.perf_counter() - self.began_wall)
         factor = self.recovery.factor if self.recovery is not None else 1.0
-        return ReplanResult(
-            status,
-            plan,
-            path,
-            self.splice,
-            targets,
-            self.report,
-            factor,
-            self.timings,
-            "; ".join(self.reasons),
-            self.iterations,
-        )
+        splice, report, timings, message = self.splice, self.report, self.timings, "; ".join(self.reasons)
+        return ReplanResult(status, plan, path, splice, targets, report, factor, timings, message, self.iterations)
