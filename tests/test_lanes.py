@@ -57,6 +57,14 @@ def test_rows_are_widened_with_zeros_and_narrowed_without_touching_what_follows(
     assert np.array_equal(wide[:, :n], rows)
     assert not wide[:, n:].any()
     around = np.full(n * (count + 2) + 2 * LANES, 7.0)
-    narrow(0.5, wide, around[LANES : LANES + n * count].reshape(count, n))
+    narrow(0.5, wide, 0, around[LANES : LANES + n * count].reshape(count, n))
     assert np.array_equal(around[LANES : LANES + n * count], 0.5 * rows.ravel())
     assert (np.delete(around, slice(LANES, LANES + n * count)) == 7.0).all()
+
+
+@pytest.mark.parametrize(("first", "n"), [(7, 1), (7, 4), (3, 4), (6, 10)])
+def test_some_columns_are_narrowed(first, n):
+    wide = RNG.normal(size=(5, 16))
+    out = np.empty((5, n))
+    narrow(2.0, wide, first, out)
+    assert np.array_equal(out, 2.0 * wide[:, first : first + n])

@@ -150,6 +150,55 @@ def test_arm_and_gripper_share_their_durations():
         GraspPlan(p.arm, slow, 0.0, p.arm_joints, p.gripper_joints)
 
 
+def frozen_phases(trajectories):
+    return tuple((t.duration, t.position, t.velocity, t.acceleration) for t in trajectories)
+
+
+def test_a_plan_of_arrays_is_the_same_plan():
+    p = plan()
+    q = GraspPlan.of(frozen_phases(p.arm), frozen_phases(p.gripper), p.start_time, p.arm_joints, p.gripper_joints)
+    assert q.arm_joints == p.arm_joints
+    assert q.gripper_joints == p.gripper_joints
+    assert q.end_time == p.end_time
+    assert np.array_equal(q.phase_ends, p.phase_ends)
+    assert np.array_equal(q.durations, p.durations)
+    for a, b in zip(q.arm + q.gripper, p.arm + p.gripper, strict=True):
+        assert a.duration == b.duration
+        for name in ("position", "velocity", "acceleration"):
+            assert getattr(a, name) is getattr(b, name)
+    for t in (0.0, 1.3, 99.0):
+        assert np.array_equal(q.sample(t).arm.acceleration, p.sample(t).arm.acceleration)
+        assert np.array_equal(q.sample(t).gripper.position, p.sample(t).gripper.position)
+
+
+@pytest.mark.parametrize("phase", range(3))
+@pytest.mark.parametrize("part", ["arm", "gripper"])
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda T, q, w, v: (T, q + 1e-6, w, v), "position jumps"),
+        (lambda T, q, w, v: (T, q, w + 1e-6, v), "velocity jumps"),
+        (lambda T, q, w, v: (T, q, w, v + np.where(v == v[1, 0], np.nan, 0.0)), "finite"),
+        (lambda T, q, w, v: (T, q, np.where(w == w[-1, -1], np.inf, w), v), "finite"),
+        (lambda T, q, w, v: (T, q[:-1], w, v), "shape"),
+        (lambda T, q, w, v: (T, q[:1], w[:1], v[:1]), "shape"),
+        (lambda T, q, w, v: (T, q[:, :-1].copy(), w[:, :-1].copy(), v[:, :-1].copy()), "columns"),
+        (lambda T, q, w, v: (0.0, q, w, v), "duration"),
+        (lambda T, q, w, v: (np.nan, q, w, v), "duration"),
+        (lambda T, q, w, v: (np.inf, q, w, v), "duration"),
+        (lambda T, q, w, v: (T + 1e-6, q, w, v), "arm takes"),
+    ],
+)
+def test_arrays_that_are_no_plan_are_refused_as_ever(phase, part, spoil, message):
+    p = plan()
+    arm, gripper = list(frozen_phases(p.arm)), list(frozen_phases(p.gripper))
+    phases = arm if part == "arm" else gripper
+    T, q, w, v = spoil(*phases[phase])
+    phases[phase] = T, frozen(np.array(q)), frozen(np.array(w)), frozen(np.array(v))
+    with pytest.raises(InvalidTrajectory, match=message):
+        GraspPlan.of(tuple(arm), tuple(gripper), 0.0, p.arm_joints, p.gripper_joints)
+
+
 def test_a_saved_plan_loads_exactly(tmp_path):
     original = plan()
     original.save(tmp_path / "plan.json")

@@ -145,13 +145,13 @@ def widen(rows: Array, out: Array) -> None:
 
 
 @njit(cache=True)
-def narrow(factor: float, rows: Array, out: Array) -> None:
-    """Write a multiple of rows (m, W) of whole lanes into rows (m, n)."""
+def narrow(factor: float, rows: Array, column: int, out: Array) -> None:
+    """Write a multiple of rows (m, W) of whole lanes, from a column on, into rows (m, n)."""
     count, n = out.shape
     width, numbers, flat = rows.shape[1], rows.ravel(), out.ravel()
     for i in range(count):
-        for j in range(0, width, LANES):
-            store(factor * load(numbers, i * width + j, LANES), flat, i * n + j, n - j)
+        for j in range(0, n, LANES):
+            store(factor * load(numbers, i * width + column + j, n - j), flat, i * n + j, n - j)
 
 
 def _as_operator(symbol: Any, instruction: str) -> None:

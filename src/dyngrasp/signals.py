@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+_Made = TypeVar("_Made")
 
 
 _FLOAT = np.dtype(float)
@@ -66,6 +69,13 @@ def _is_frozen(values: ArrayLike) -> bool:
     return type(owner) is np.ndarray and owner.flags.owndata and not owner.flags.writeable
 
 
+def made(kind: type[_Made], **attributes: object) -> _Made:
+    """A frozen dataclass of attributes that are known to be what it asks for: nothing is looked at a second time."""
+    value = object.__new__(kind)
+    value.__dict__.update(attributes)
+    return value
+
+
 @dataclass(frozen=True)
 class JointState:
     """Position (rad), velocity (rad/s) and acceleration (rad/s²) of n joints, each of shape (n,), at time `t` (s)."""
@@ -78,6 +88,12 @@ class JointState:
     def __post_init__(self) -> None:
         for name in ("position", "velocity", "acceleration"):
             object.__setattr__(self, name, vector(getattr(self, name)))
+
+    @classmethod
+    def of(cls, t: float, state: Array) -> JointState:
+        """A state of q, q̇, q̈ in one array (3, n), just made, that nobody else holds: it becomes read-only."""
+        frozen(state)
+        return made(cls, t=t, position=state[0], velocity=state[1], acceleration=state[2])
 
 
 @dataclass(frozen=True)

@@ -12,19 +12,40 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from dyngrasp.errors import InvalidTrajectory, PlanFileError
-from dyngrasp.signals import Array, JointState, frozen, read_only
+from dyngrasp.motion_arrays import (
+    JOIN_TOLERANCE,
+    PhaseArrays,
+    Phases,
+    all_finite,
+    interpolate,
+    largest,
+    largest_defect,
+    largest_difference,
+    largest_jump,
+    make_a_plan,
+    write_state,
+)
+from dyngrasp.signals import Array, JointState, frozen, made, read_only
+
+__all__ = [
+    "JOIN_TOLERANCE",
+    "PHASE_NAMES",
+    "GraspPlan",
+    "PhaseArrays",
+    "Phases",
+    "PlanSample",
+    "Trajectory",
+    "interpolate",
+    "largest",
+    "largest_defect",
+    "largest_difference",
+    "write_state",
+]
 
 PHASE_NAMES = ("approach", "grasp", "deliver")
-
-# A join is two roundings of the same number, so it may differ by a few ulp of 2π and no more.
-JOIN_TOLERANCE = 1e-9
-
-PhaseArrays = tuple[float, Array, Array, Array]
-Phases = tuple[PhaseArrays, ...]
 
 
 @dataclass(frozen=True)
@@ -56,7 +77,7 @@ class Trajectory:
             raise InvalidTrajectory(f"position, velocity and acceleration need one shape (N+1, n), N ≥ 1; got {shapes}")
         if not (math.isfinite(self.duration) and self.duration > 0):
             raise InvalidTrajectory(f"duration must be a positive number of seconds, got {self.duration}")
-        if not _all_finite(q, w, v):
+        if not all_finite(q, w, v):
             raise InvalidTrajectory("a trajectory holds finite numbers only")
 
     @classmethod
@@ -87,8 +108,8 @@ class Trajectory:
     def sample_as(self, local: float, t: float, at_rest: bool = False) -> JointState:
         """State at `local` (s) under the time `t` (s) of another clock; with velocity and acceleration 0 if at rest."""
         state = np.empty((3, self.position.shape[1]))
-        _write_state(self.arrays, local, at_rest, state)
-        return JointState(t, frozen(state)[0], state[1], state[2])
+        write_state(self.arrays, local, at_rest, state)
+        return JointState.of(t, state)
 
     def sample_many(self, times: ArrayLike) -> tuple[Array, Array, Array]:
         """States between the grid points, consistent with the collocation.
@@ -112,111 +133,6 @@ class Trajectory:
     def dynamics_defect(self) -> float:
         """Largest violation of the trapezoidal rule, eq. (3b), over all joints and intervals (rad or rad/s)."""
         return largest_defect(self.arrays)
-
-
-@njit(cache=True)
-def largest_difference(a, b):
-    """Largest |a − b| of two vectors (n,); NaN if one of their elements is."""
-    largest = 0.0
-    for i in range(a.size):
-        step = abs(a[i] - b[i])
-        # A NaN, once found, stays.
-        if not step <= largest and largest == largest:
-            largest = step
-    return largest
-
-
-@njit(cache=True)
-def _largest_jump(phases):
-    """Largest jump of positions and velocities over both joins of three phases."""
-    largest = 0.0
-    for i in range(2):
-        (_, q, w, _), (_, q_next, w_next, _) = phases[i], phases[i + 1]
-        largest = max(largest, largest_difference(q[-1], q_next[0]), largest_difference(w[-1], w_next[0]))
-    return largest
-
-
-@njit(cache=True, fastmath={"reassoc"})
-def _all_finite(position, velocity, acceleration):
-    for array in (position, velocity, acceleration):
-        # Nothing times a finite number is nothing. Summed up without a branch, for that becomes vector instructions.
-        values, rest = array.ravel(), 0.0
-        for i in range(values.size):
-            rest += 0.0 * values[i]
-        if rest != 0.0:
-            return False
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def _write_state(trajectory, local, at_rest, state):
-    """See `Trajectory.sample_as`; state (3, n)."""
-    interpolate(trajectory, np.full(1, local), state.reshape(3, 1, -1))
-    if at_rest:
-        state[1:] = 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def interpolate(trajectory, times, out):
-    """`Trajectory.sample_many` (3, M, n); compiled, for controllers and audits ask for little and often."""
-    duration, position, velocity, acceleration = trajectory
-    N, n = position.shape[0] - 1, position.shape[1]
-    step = duration / N
-    for m in range(times.size):
-        scaled = min(max(times[m], 0.0), duration) / step
-        k = max(min(int(scaled), N - 1), 0)
-        s = scaled - k
-        if s == 0.0 or s == 1.0:
-            # Most of what is asked for are grid points.
-            for i in range(n):
-                at = k + int(s)
-                out[0, m, i], out[1, m, i], out[2, m, i] = position[at, i], velocity[at, i], acceleration[at, i]
-            continue
-        by_rate, half, sixth, gain = step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12), step * s**2 / 2
-        for i in range(n):
-            v_k = acceleration[k, i]
-            dv = acceleration[k + 1, i] - v_k
-            out[0, m, i] = position[k, i] + by_rate * velocity[k, i] + half * v_k + sixth * dv
-            out[1, m, i] = velocity[k, i] + by_rate * v_k + gain * dv
-            out[2, m, i] = v_k + s * dv
-
-
-@njit(cache=True, error_model="numpy")
-def largest_defect(trajectory):
-    """`Trajectory.dynamics_defect`; a NaN is the largest."""
-    duration, position, velocity, acceleration = trajectory
-    half_step, n = duration / (position.shape[0] - 1) / 2, position.shape[1]
-    q, w, v = position.ravel(), velocity.ravel(), acceleration.ravel()
-    in_q, in_w = (
-        _violation(half_step, q[:-n], q[n:], w[:-n], w[n:]),
-        _violation(half_step, w[:-n], w[n:], v[:-n], v[n:]),
-    )
-    return largest(np.array([in_q, in_w]))
-
-
-@njit(cache=True, error_model="numpy")
-def _violation(half_step, x, x_next, rate, rate_next):
-    """Largest |x′ − x − Δt/2 (ẋ′ + ẋ)| of arrays (M,) and their values one grid point later."""
-    defects = np.empty(x.size)
-    for i in range(x.size):
-        defects[i] = abs(x_next[i] - x[i] - half_step * (rate_next[i] + rate[i]))
-    return largest(defects)
-
-
-_ALL_BUT_SIGN = 0x7FFF_FFFF_FFFF_FFFF
-
-
-@njit(cache=True)
-def largest(values):
-    """Largest of numbers (M,), M ≥ 1; a NaN without a sign is larger than all.
-
-    Read as integers floats keep their order, once the negative ones are turned round. Comparisons of integers become
-    vector instructions, while those of floats do not, for they have to mind NaNs.
-    """
-    bits, most = values.view(np.int64), np.int64(-_ALL_BUT_SIGN)
-    for i in range(bits.size):
-        most = max(most, bits[i] ^ ((bits[i] >> 63) & _ALL_BUT_SIGN))
-    return np.full(1, most ^ ((most >> 63) & _ALL_BUT_SIGN)).view(np.float64)[0]
 
 
 @dataclass(frozen=True)
@@ -264,11 +180,39 @@ class GraspPlan:
                         f"{what}, phase {phase}: {trajectory.position.shape[1]} columns for {len(joints)} joints"
                     )
         for phases, trajectories, what in zip(self.arrays, (self.arm, self.gripper), ("arm", "gripper"), strict=False):
-            if not _largest_jump(phases) <= JOIN_TOLERANCE:
+            if not largest_jump(phases) <= JOIN_TOLERANCE:
                 self._refuse_jump(trajectories, what)
         for phase, arm, gripper in zip(PHASE_NAMES, self.arm, self.gripper, strict=True):
             if abs(arm.duration - gripper.duration) > JOIN_TOLERANCE:
                 raise InvalidTrajectory(f"phase {phase}: arm takes {arm.duration} s, gripper {gripper.duration} s")
+
+    @classmethod
+    def of(
+        cls,
+        arm: Phases,
+        gripper: Phases,
+        start_time: float,
+        arm_joints: tuple[str, ...],
+        gripper_joints: tuple[str, ...],
+    ) -> GraspPlan:
+        """A plan of `arrays` that nobody can write to, checked in one go: one is made in every replanning cycle.
+
+        Raises:
+            InvalidTrajectory: As `Trajectory` and the plan itself.
+        """
+        if not make_a_plan(arm, gripper, len(arm_joints), len(gripper_joints)):
+            # These say what is wrong.
+            phases = [tuple(Trajectory(*phase) for phase in phases) for phases in (arm, gripper)]
+            return cls(*phases, start_time, arm_joints, gripper_joints)  # type: ignore[arg-type]
+        return made(
+            cls,
+            arm=tuple([_known(*phase) for phase in arm]),
+            gripper=tuple([_known(*phase) for phase in gripper]),
+            start_time=start_time,
+            arm_joints=arm_joints,
+            gripper_joints=gripper_joints,
+            arrays=(arm, gripper, _ends_of(arm, start_time)),
+        )
 
     @staticmethod
     def _refuse_jump(phases: tuple[Trajectory, ...], what: str) -> None:
@@ -291,14 +235,14 @@ class GraspPlan:
         return read_only(self._ends)
 
     @cached_property
-    def _ends(self) -> tuple[float, ...]:
-        return tuple(self.start_time + passed for passed in itertools.accumulate(phase.duration for phase in self.arm))
-
-    @cached_property
     def arrays(self) -> tuple[Phases, Phases, tuple[float, ...]]:
         """What compiled code takes for a plan: ΔT, q, q̇, q̈ of each phase, of arm and of gripper; T_1, T_2, T_3."""
         arm, gripper = (tuple(trajectory.arrays for trajectory in phases) for phases in (self.arm, self.gripper))
-        return arm, gripper, self._ends
+        return arm, gripper, _ends_of(arm, self.start_time)
+
+    @property
+    def _ends(self) -> tuple[float, ...]:
+        return self.arrays[2]
 
     @property
     def end_time(self) -> float:
@@ -368,6 +312,16 @@ class GraspPlan:
             raise PlanFileError(path, str(error.args[0]), None, "is missing") from error
         except (TypeError, ValueError, InvalidTrajectory) as error:
             raise PlanFileError(path, None, None, f"does not hold a plan: {error}") from error
+
+
+def _known(duration: float, position: Array, velocity: Array, acceleration: Array) -> Trajectory:
+    """A trajectory of what has been checked."""
+    return made(Trajectory, duration=duration, position=position, velocity=velocity, acceleration=acceleration)
+
+
+def _ends_of(phases: Phases, start_time: float) -> tuple[float, ...]:
+    """When phases end that follow one another (s)."""
+    return tuple([start_time + passed for passed in itertools.accumulate([phase[0] for phase in phases])])
 
 
 def _to_json(trajectory: Trajectory) -> dict[str, Any]:

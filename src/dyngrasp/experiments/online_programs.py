@@ -125,7 +125,7 @@ def _consistent(motion: Trajectory) -> Trajectory:
     problem = TrackingProblem(
         motion, start, end, True, True, -wide, wide, wide, wide, motion.duration, motion.duration, _WEIGHTS
     )
-    return solve_tracking(problem).trajectory(problem)
+    return solve_tracking(problem).trajectory
 
 
 def structured_row(case: str, problems: Iterable[TrackingProblem]) -> dict[str, Any]:

@@ -171,9 +171,7 @@ class Attempt:
 
     def _track(self, targets: GraspTargets, way: int = 0) -> Candidate:
         started = time.perf_counter()
-        candidate = track(
-            self.plan, targets, self.task, self.splice, self.settings.tracking, way, self.previous, self.state
-        )
+        candidate = track(self.plan, targets, self.task, self.splice, self.settings.tracking, way, self.previous)
         self._count("tracking", started)
         return candidate
 

@@ -12,22 +12,27 @@ them its difference to the old motion is a polynomial.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import pinocchio as pin
 from numba import njit
 
 from dyngrasp.errors import OutOfReach
+from dyngrasp.lanes import LANES, lanes_of, load, store
 from dyngrasp.models.flange_chain import place_frames
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
+from dyngrasp.planning.part_motion import PartMotion, part_motion, part_poses
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import Array, read_only
-from dyngrasp.trajectory import Trajectory
+from dyngrasp.trajectory import PhaseArrays, write_state
 
-_KNOTS = 4
+KNOTS = 4
 
-_AT_REST = read_only(np.tile(np.eye(3, 4), (_KNOTS - 1, 1, 1)))
+# The grid point where the descent begins, postures (KNOTS, n) at its knots (rad), and the weight of its positions in
+# units of Q_v (1/s⁴).
+Descent = tuple[int, Array, float]
+NO_DESCENT: Descent = 0, np.empty((0, 0)), 0.0
+
+_STANDING: PartMotion = np.eye(3), np.zeros(3), read_only(np.zeros(6)), 0.0
 
 
 @dataclass(frozen=True)
@@ -47,77 +52,111 @@ class DescentSettings:
 
 
 def carried_descent(
-    reference: Trajectory,
+    approach: PhaseArrays,
     start: float,
+    splice: float,
     targets: GraspTargets,
     previous: GraspTargets | None,
     task: GraspTask,
     settings: DescentSettings,
-) -> tuple[Trajectory, Array] | None:
-    """The reference with its descent carried along with the part, and the weights of its positions.
+) -> Descent:
+    """Where the descent of an approach passes when it is carried along with the part.
 
     Args:
-        reference: What is left of the approach.
-        start: When it begins (s).
+        approach: Of the running plan.
+        start: When the rest of it begins, counted from its own beginning (s).
+        splice: The same on the clock of the part (s).
         targets: The new ones.
         previous: What the running plan was made for; if left out, a part at rest.
         task: Arm, gripper, part.
         settings: How.
 
     Returns:
-        Reference and weights (N+1,) in units of Q_v (1/s⁴); None if the arm cannot follow the carried motion.
+        `NO_DESCENT` if the arm cannot follow the carried motion.
     """
     updater, chain = target_updater(task), task.robot.flange_chain
-    N, T, position = reference.intervals, reference.duration, reference.position
-    hand = updater.T_flange_grasp(targets.gripper_open)
+    N, n = approach[1].shape[0] - 1, approach[1].shape[1]
     begin = settings.height * task.grasp_object.funnel.z_threshold - task.settings.pregrasp_distance
-    below = _first_below(chain.rotations, chain.offsets, position, hand.translation, hand.rotation, begin)
-    entry = min(max(below, round(settings.earliest * N)), N - _KNOTS)
-    knots = _knots(entry, N)
-    old, new = (_from_end(moves, start, T, N, knots) for moves in (previous, targets))
-    poses, postures = np.empty((_KNOTS - 1, 3, 4)), np.empty((_KNOTS, position.shape[1]))
-    postures[-1] = targets.pregrasp.position
-    _carried_poses(chain.rotations, chain.offsets, position, knots, postures[-1], old, new, poses)
+    parts = tuple(part_motion(t) if t is not None and t.moving else _STANDING for t in (previous, targets))
+    poses, old, postures = np.empty((KNOTS - 1, 3, 4)), np.empty((KNOTS - 1, n)), np.empty((KNOTS, n))
+    entry = _carried_poses(
+        approach,
+        start,
+        splice,
+        (chain.rotations, chain.offsets),
+        updater.T_flange_grasp(targets.gripper_open).homogeneous,
+        begin,
+        round(settings.earliest * N),
+        targets.pregrasp.position,
+        parts,
+        poses,
+        old,
+    )
     try:
-        for i, k in enumerate(knots[:-1]):
-            postures[i] = updater.posture(pin.SE3(poses[i, :, :3], poses[i, :, 3]), position[k])
+        postures[:-1] = updater.postures(poses, old)
     except OutOfReach:
-        return None
-    motion, weights = np.empty((3, *position.shape)), np.zeros(N + 1)
-    bent = (position, reference.velocity, reference.acceleration)
-    _bend(bent, entry, T, _lagrange(entry, N), knots, postures, motion)
-    weights[entry:] = (settings.stiffness / ((1 - entry / N) * T)) ** 4
-    return Trajectory.of(T, motion), weights
-
-
-def _from_end(targets: GraspTargets | None, start: float, duration: float, N: int, knots: tuple[int, ...]) -> Array:
-    """(K−1, 3, 4) motion [R | p] of a part that takes its pose at the end to that at each knot but the last."""
-    if targets is None or not targets.moving:
-        return _AT_REST
-    back = targets.T_world_object_at(start + duration).inverse()
-    times = (start + k / N * duration for k in knots[:-1])
-    return np.array([(targets.T_world_object_at(t) * back).homogeneous[:3] for t in times])
+        return NO_DESCENT
+    postures[-1] = targets.pregrasp.position
+    return entry, postures, (settings.stiffness / ((1 - entry / N) * (approach[0] - start))) ** 4
 
 
 @njit(cache=True, error_model="numpy")
-def _carried_poses(rotations, offsets, position, knots, q_end, old, new, poses):
-    """Write the poses (K−1, 3, 4) of the flange at the knots of positions (N+1, n), carried along with the part.
+def _knot(entry, N, i):
+    """The grid point of one of the knots: the first at `entry`, the last at N."""
+    return entry + int(np.rint(i * (N - entry) / (KNOTS - 1)))
+
+
+@njit(cache=True, error_model="numpy")
+def _carried_poses(approach, start, splice, chain, T_flange_grasp, begin, earliest, q_end, parts, poses, postures):
+    """Write poses (KNOTS−1, 3, 4) of the flange and the old postures (KNOTS−1, n) at all knots but the last.
 
     What takes the old end to the new one, at `q_end` (n,), takes the old motion to the new one as seen from the part.
-    Parts that move were elsewhere then, as `_from_end` tells of the old and the new one.
+    Parts that move were elsewhere then.
+
+    Returns:
+        The grid point of the rest of the approach where the descent begins.
     """
-    frames = np.empty((q_end.size + 1, 3, 4))
-    place_frames(rotations, offsets, position[-1], frames)
+    rotations, offsets = chain
+    N, n = approach[1].shape[0] - 1, approach[1].shape[1]
+    state, frames, seen = np.empty((3, n)), np.empty((n + 1, 3, 4)), np.empty((3, 4))
+    step = (approach[0] - start) / N
+    below = _first_below(approach, start, step, rotations, offsets, T_flange_grasp, begin, state, frames)
+    entry = min(max(below, earliest), N - KNOTS)
+
+    times = np.empty(KNOTS)
+    for i in range(KNOTS):
+        times[i] = splice + _knot(entry, N, i) * step
+    moves = np.empty((2, KNOTS, 3, 4))
+    _from_end(parts[0], times, moves[0])
+    _from_end(parts[1], times, moves[1])
+    place_frames(rotations, offsets, approach[1][-1], frames)
     old_end = frames[-1].copy()
     place_frames(rotations, offsets, q_end, frames)
     new_end = frames[-1].copy()
-    seen = np.empty((3, 4))
-    for i in range(poses.shape[0]):
-        place_frames(rotations, offsets, position[knots[i]], frames)
-        _before(old[i], frames[-1], seen)
+    for i in range(KNOTS - 1):
+        write_state(approach, start + step * _knot(entry, N, i), False, state)
+        postures[i] = state[0]
+        place_frames(rotations, offsets, state[0], frames)
+        _before(moves[0, i], frames[-1], seen)
         _before(old_end, seen, frames[0])
         _after(new_end, frames[0], seen)
-        _after(new[i], seen, poses[i])
+        _after(moves[1, i], seen, poses[i])
+    return entry
+
+
+@njit(cache=True, error_model="numpy")
+def _from_end(part, times, moves):
+    """Write the motions (M, 3, 4) that take a part from its pose at the last of some times (M,) to that at each."""
+    R, p = np.empty((3, 3, times.size)), np.empty((3, times.size))
+    part_poses(part, times, R, p)
+    back, there = np.zeros((3, 4)), np.empty((3, 4))
+    for a in range(3):
+        for b in range(3):
+            back[a, b] = R[b, a, -1]
+            back[a, 3] -= R[b, a, -1] * p[b, -1]
+    for i in range(times.size):
+        there[:, :3], there[:, 3] = R[:, :, i], p[:, i]
+        _after(there, back, moves[i])
 
 
 @njit(cache=True, error_model="numpy")
@@ -141,75 +180,67 @@ def _before(first, then, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _first_below(rotations, offsets, position, p_flange_grasp, R_flange_grasp, begin):
-    """By bisection, the first grid point of positions (N+1, n) from which G is no higher above its last than `begin`.
+def _first_below(approach, start, step, rotations, offsets, T_flange_grasp, begin, state, frames):
+    """By bisection, the first grid point of the rest of an approach from which G is at most `begin` above its last.
 
-    Heights (m) are along the axis of the grasp frame as the hand holds it at the last point.
+    Heights (m) are along the axis of the grasp frame as the hand holds it at the last point. State (3, n) and frames
+    (n+1, 3, 4) are for scratch.
     """
-    frames = np.empty((position.shape[1] + 1, 3, 4))
-    place_frames(rotations, offsets, position[-1], frames)
+    above, below, middle = -1, approach[1].shape[0] - 1, 0
+    place_frames(rotations, offsets, approach[1][-1], frames)
     axis = np.zeros(3)
     for a in range(3):
         for b in range(3):
-            axis[a] += frames[-1, a, b] * R_flange_grasp[b, 2]
-    last = _height(frames[-1], p_flange_grasp, axis)
-    above, below = 0, position.shape[0] - 1
-    place_frames(rotations, offsets, position[0], frames)
-    if _height(frames[-1], p_flange_grasp, axis) - last <= begin:
-        return 0
+            axis[a] += frames[-1, a, b] * T_flange_grasp[b, 2]
+    last = _height(frames[-1], T_flange_grasp, axis)
     while below - above > 1:
-        middle = (above + below) // 2
-        place_frames(rotations, offsets, position[middle], frames)
-        if _height(frames[-1], p_flange_grasp, axis) - last > begin:
+        write_state(approach, start + step * middle, False, state)
+        place_frames(rotations, offsets, state[0], frames)
+        if _height(frames[-1], T_flange_grasp, axis) - last > begin:
             above = middle
         else:
             below = middle
+        middle = (above + below) // 2
     return below
 
 
 @njit(cache=True, error_model="numpy")
-def _height(flange, p_flange_grasp, axis):
+def _height(flange, T_flange_grasp, axis):
     height = 0.0
     for a in range(3):
         height += axis[a] * flange[a, 3]
         for b in range(3):
-            height += axis[a] * flange[a, b] * p_flange_grasp[b]
+            height += axis[a] * flange[a, b] * T_flange_grasp[b, 3]
     return height
 
 
 @njit(cache=True, error_model="numpy")
-def _bend(old, entry, T, polynomials, knots, postures, motion):
-    """Write a motion (3, N+1, n): from `entry` on polynomials bend the old one to the postures (K, n) at the knots."""
-    factor, difference = 1.0, postures.copy()
-    for i in range(len(knots)):
-        difference[i] -= old[0][knots[i]]
-    for kind in range(3):
-        motion[kind] = old[kind]
-        for k in range(polynomials[kind].shape[0]):
-            for i in range(difference.shape[0]):
-                weight = factor * polynomials[kind][k, i]
-                for j in range(difference.shape[1]):
-                    motion[kind, entry + k, j] += weight * difference[i, j]
-        factor /= T
+def bend(entry: int, postures: Array, T: float, motion: Array) -> None:
+    """Bend q, q̇, q̈ (3, N+1, W) of a motion of n joints, from grid point `entry` on, to postures (KNOTS, n).
 
-
-def _knots(entry: int, N: int) -> tuple[int, ...]:
-    """`_KNOTS` grid points from `entry` to N."""
-    return tuple(entry + round(i * (N - entry) / (_KNOTS - 1)) for i in range(_KNOTS))
-
-
-@lru_cache(maxsize=512)
-def _lagrange(entry: int, N: int) -> tuple[Array, Array, Array]:
-    """Values, first and second derivatives of the Lagrange polynomials of `_knots` (M, K), at grid points from `entry`.
-
-    The argument is the share of the duration.
+    What is added is a polynomial of each joint, in Newton's form over the share of the duration T (s).
     """
-    knots, s = np.array(_knots(entry, N)) / N, np.arange(entry, N + 1) / N
-    # About their middle, for powers of numbers near one are nearly alike.
-    middle = knots.mean()
-    inverse = np.linalg.inv(np.vander(knots - middle, increasing=True))
-    powers = np.vander(s - middle, len(knots), increasing=True)
-    order = np.arange(1, len(knots))
-    first = powers[:, :-1] * order
-    second = first[:, :-1] * order[:-1]
-    return read_only(powers @ inverse), read_only(first @ inverse[1:]), read_only(second @ inverse[2:])
+    N, width = motion.shape[1] - 1, motion.shape[2]
+    knots, table = np.empty(KNOTS), np.zeros((KNOTS, width))
+    for i in range(KNOTS):
+        k = _knot(entry, N, i)
+        knots[i] = k / N
+        for j in range(postures.shape[1]):
+            table[i, j] = postures[i, j] - motion[0, k, j]
+    for order in range(1, KNOTS):
+        for i in range(KNOTS - 1, order - 1, -1):
+            for j in range(width):
+                table[i, j] = (table[i, j] - table[i - 1, j]) / (knots[i] - knots[i - order])
+    flat, q, w, a = table.ravel(), motion[0].ravel(), motion[1].ravel(), motion[2].ravel()
+    for j in range(0, width, LANES):
+        for k in range(entry, N + 1):
+            value, rate, curvature = load(flat, (KNOTS - 1) * width + j, LANES), lanes_of(0.0), lanes_of(0.0)
+            for i in range(KNOTS - 2, -1, -1):
+                s = k / N - knots[i]
+                curvature = s * curvature + 2.0 * rate
+                rate = s * rate + value
+                value = s * value + load(flat, i * width + j, LANES)
+            at = k * width + j
+            store(load(q, at, LANES) + value, q, at, LANES)
+            store(load(w, at, LANES) + (1.0 / T) * rate, w, at, LANES)
+            store(load(a, at, LANES) + (1.0 / T**2) * curvature, a, at, LANES)

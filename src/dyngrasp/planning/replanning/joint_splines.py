@@ -23,13 +23,14 @@ from dyngrasp.signals import Array
 
 Indices = NDArray[np.int64]
 Motion = tuple[Array, Array, Array]  # q, q̇, q̈, each (N+1, n)
+Filters = tuple[Indices, Array, Array]  # of `filters`
 
 POSITION, RATE, CURVATURE = 0, 1, 2
 TAPS = 3
 
 
 @lru_cache(maxsize=64)
-def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -> tuple[Indices, Array, Array]:
+def filters(intervals: int, hold_start: bool, hold_end: bool, ends_cost: bool) -> Filters:
     """How grid points depend on the unknowns, and the bands of Σ_k zᵀz.
 
     Args:

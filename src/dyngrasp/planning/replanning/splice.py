@@ -16,23 +16,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.problem import MIN_INTERVALS, Status
-from dyngrasp.planning.replanning.carried_descent import carried_descent
+from dyngrasp.planning.replanning.carried_descent import NO_DESCENT, carried_descent
+from dyngrasp.planning.replanning.joint_splines import filters
 from dyngrasp.planning.replanning.phase_programs import (
     APPROACH,
     GRASP,
     TrackingSettings,
-    program_between,
-    splice_program,
-    whole_phase,
-    with_hand,
+    limits_of,
+    stretch,
+    track_phases,
+    write_rest,
 )
-from dyngrasp.planning.replanning.tracking_qp import TrackingSolution, solve_tracking
+from dyngrasp.planning.replanning.tracking_qp import STATUS
 from dyngrasp.signals import frozen
-from dyngrasp.trajectory import GraspPlan, PlanSample, Trajectory, interpolate
+from dyngrasp.trajectory import GraspPlan, Trajectory
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,15 @@ class Candidate:
         status: `converged`, or what the first failing phase said.
         plan: None unless converged.
         splice: When it takes over (s).
-        solutions: Of the phases tracked.
+        iterations: Of the interior point method over all phases; 0 where no box was active.
         message: Which phase failed.
     """
 
     status: Status
     plan: GraspPlan | None
     splice: float
-    solutions: tuple[TrackingSolution, ...] = ()
+    iterations: int
     message: str = ""
-
-    @property
-    def iterations(self) -> int:
-        """Of the interior point method over all phases; 0 where no box was active."""
-        return sum(solution.iterations for solution in self.solutions)
 
 
 def splice_time(plan: GraspPlan, wanted: float) -> float:
@@ -71,26 +66,15 @@ def splice_time(plan: GraspPlan, wanted: float) -> float:
 def rest_of(trajectory: Trajectory, start: float, intervals: int) -> Trajectory:
     """What is left of a motion after `start` (s), on a grid of its own; obeys the trapezoidal rule only nearly."""
     motion = np.empty((3, intervals + 1, trajectory.position.shape[1]))
-    _write_rest(trajectory.duration, trajectory.position, trajectory.velocity, trajectory.acceleration, start, motion)
+    write_rest(trajectory.arrays, float(start), motion)
     return Trajectory.of(trajectory.duration - start, motion)
 
 
-@njit(cache=True, error_model="numpy")
-def _write_rest(duration, position, velocity, acceleration, start, motion):
-    """Write q, q̇, q̈ (3, M+1, n) at M+1 times from `start` (s) to the end."""
-    M = motion.shape[1] - 1
-    times = start + (duration - start) / M * np.arange(M + 1)
-    interpolate((duration, position, velocity, acceleration), times, motion)
-
-
-@njit(cache=True)
-def _stands(velocity, acceleration):
-    """Whether all rates (N+1, n) are zero."""
-    for array in (velocity, acceleration):
-        for rate in array.flat:
-            if rate != 0.0:
-                return False
-    return True
+def stretched(trajectory: Trajectory, duration: float) -> Trajectory:
+    """The same path in another time."""
+    rates = np.empty((2, *trajectory.position.shape))
+    stretch(trajectory.arrays, float(duration), rates)
+    return Trajectory(duration, trajectory.position, frozen(rates)[0], rates[1])
 
 
 def track(
@@ -101,7 +85,6 @@ def track(
     settings: TrackingSettings,
     way: int = 0,
     previous: GraspTargets | None = None,
-    state: PlanSample | None = None,
 ) -> Candidate:
     """Continue a plan from the splice on to new targets.
 
@@ -113,110 +96,51 @@ def track(
         settings: How.
         way: Which of the descents.
         previous: What the plan was made for; only a moving part makes a difference.
-        state: Of the plan at the splice, if it is known already.
     """
-    begun = plan.phase_at(splice)
-    state = state or plan.sample(splice)
-    solutions: list[TrackingSolution] = []
-    arm, hand = list(plan.arm), list(plan.gripper)
-    for phase in range(begun, 3):
+    arm, hand, ends = plan.arrays
+    begun, paper, descent = plan.phase_at(splice), settings.paper_rows, NO_DESCENT
+    start, row = float(splice - (ends[begun] - arm[begun][0])), 0
+    if begun == GRASP:
+        N = plan.arm[GRASP].intervals
+        row = min(max(round(start / arm[GRASP][0] * N), 0), N - MIN_INTERVALS)
+    elif not paper:
+        descent = carried_descent(arm[APPROACH], start, splice, targets, previous, task, settings.descents[way])
+    shapes = [motion[1].shape for motion in arm]
+    grids = [filters(shape[0] - 1, paper, paper, not paper) for shape in shapes]
+    grids[begun] = filters(shapes[begun][0] - 1 - row, True, paper, not paper)
+    motions = [np.empty((3, *shape)) for shape in shapes]
+    fingers = [np.empty((3, shapes[APPROACH][0], len(targets.gripper_open)))]
+    fingers += [np.empty((2, *motion[1].shape)) for motion in hand[GRASP:]]
+    pregrasp, grasped, place = targets.pregrasp, targets.grasped, targets.place
+    failed, outcome, durations, iterations = track_phases(
+        arm,
+        hand,
+        begun,
+        start,
+        (
+            (pregrasp.position, pregrasp.velocity),
+            (grasped.position, grasped.velocity),
+            (place.position, place.velocity),
+        ),
+        targets.gripper_open,
+        descent,
+        limits_of(task),
+        settings.rules,
+        tuple(grids),
+        tuple(motions),
+        tuple(fingers),
+    )
+    if failed < len(arm):
+        message = f"no motion within the boxes in phase {failed + 1} ({STATUS[outcome]})"
+        return Candidate(STATUS[outcome], None, splice, iterations, message)
+    new_arm, new_hand = list(arm), list(hand)
+    for phase in range(begun, len(arm)):
+        T, q, path = durations[phase], frozen(motions[phase]), frozen(fingers[phase])
+        new_arm[phase] = T, q[0], q[1], q[2]
         if phase == APPROACH:
-            solution, arm[phase], hand[phase] = _approach(plan, state, targets, task, splice, settings, way, previous)
-        elif phase == begun:
-            solution, arm[phase] = _rest_of_grasp(plan, targets, task, splice, settings)
-        else:
-            start, end = (targets.pregrasp, targets.grasped) if phase == GRASP else (targets.grasped, targets.place)
-            problem = whole_phase(plan, phase, start, end, task, settings)
-            solution = solve_tracking(problem)
-            if solution.status is Status.CONVERGED:
-                arm[phase] = solution.trajectory(problem)
-                hand[phase] = stretched(plan.gripper[phase], arm[phase].duration)
-        solutions.append(solution)
-        if solution.status is not Status.CONVERGED:
-            message = f"no motion within the boxes in phase {phase + 1} ({solution.status})"
-            return Candidate(solution.status, None, splice, tuple(solutions), message)
-    start_time = splice if begun == APPROACH else plan.start_time
-    new = GraspPlan(tuple(arm), tuple(hand), start_time, plan.arm_joints, plan.gripper_joints)  # type: ignore[arg-type]
-    return Candidate(Status.CONVERGED, new, splice, tuple(solutions))
-
-
-def stretched(trajectory: Trajectory, duration: float) -> Trajectory:
-    """The same path in another time."""
-    ratio = trajectory.duration / duration
-    if ratio == 1.0:
-        return trajectory
-    velocity, acceleration = trajectory.velocity * ratio, trajectory.acceleration * ratio**2
-    return Trajectory(duration, trajectory.position, frozen(velocity), frozen(acceleration))
-
-
-def _approach(
-    plan: GraspPlan,
-    state: PlanSample,
-    targets: GraspTargets,
-    task: GraspTask,
-    splice: float,
-    settings: TrackingSettings,
-    way: int,
-    previous: GraspTargets | None,
-) -> tuple[TrackingSolution, Trajectory, Trajectory]:
-    local = splice - (plan.phase_ends[APPROACH] - plan.durations[APPROACH])
-    N, n = plan.arm[APPROACH].intervals, task.robot.n
-    reference, hand = rest_of(plan.arm[APPROACH], local, N), plan.gripper[APPROACH]
-    still = _stands(hand.velocity, hand.acceleration)
-    if not still:
-        hand = rest_of(hand, local, N)
-        still = _stands(hand.velocity, hand.acceleration)
-    weights = None
-    if not settings.paper_rows:
-        carried = carried_descent(reference, splice, targets, previous, task, settings.descents[way])
-        if carried is not None:
-            reference, weights = carried
-            weights *= settings.weights.acceleration
-    problem = splice_program(reference, state.arm, targets.pregrasp, task, settings, weights)
-    if not still:
-        problem = with_hand(problem, hand, state.gripper, targets, task)
-    solution = solve_tracking(problem)
-    if solution.status is not Status.CONVERGED:
-        return solution, plan.arm[APPROACH], plan.gripper[APPROACH]
-    both = solution.trajectory(problem)
-    if still:
-        return solution, both, Trajectory(both.duration, hand.position, hand.velocity, hand.acceleration)
-    columns = (slice(0, n), slice(n, None))
-    arm, fingers = (
-        Trajectory(both.duration, both.position[:, c], both.velocity[:, c], both.acceleration[:, c]) for c in columns
-    )
-    return solution, arm, fingers
-
-
-def _rest_of_grasp(
-    plan: GraspPlan, targets: GraspTargets, task: GraspTask, splice: float, settings: TrackingSettings
-) -> tuple[TrackingSolution, Trajectory]:
-    whole = plan.arm[GRASP]
-    step = whole.duration / whole.intervals
-    node = round((splice - plan.phase_ends[APPROACH]) / step)
-    node = min(max(node, 0), whole.intervals - MIN_INTERVALS)
-    rest = Trajectory(
-        step * (whole.intervals - node), whole.position[node:], whole.velocity[node:], whole.acceleration[node:]
-    )
-    problem = program_between(
-        rest,
-        np.array([rest.position[0], rest.velocity[0], rest.acceleration[0]]),
-        np.array([targets.grasped.position, targets.grasped.velocity, rest.acceleration[-1]]),
-        (True, settings.paper_rows),
-        (rest.duration, rest.duration),
-        task,
-        settings,
-    )
-    solution = solve_tracking(problem)
-    if solution.status is not Status.CONVERGED:
-        return solution, whole
-    new = solution.trajectory(problem)
-    joined = (
-        np.vstack([old[:node], ahead])
-        for old, ahead in (
-            (whole.position, new.position),
-            (whole.velocity, new.velocity),
-            (whole.acceleration, new.acceleration),
-        )
-    )
-    return solution, Trajectory(whole.duration, *joined)
+            new_hand[phase] = T, path[0], path[1], path[2]
+        elif phase > begun:
+            new_hand[phase] = T, hand[phase][1], path[0], path[1]
+    begin = splice if begun == APPROACH else plan.start_time
+    new = GraspPlan.of(tuple(new_arm), tuple(new_hand), begin, plan.arm_joints, plan.gripper_joints)
+    return Candidate(Status.CONVERGED, new, splice, iterations)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.lanes import LANES, lanes_of, load, narrow, store, sum_of, whole_lanes, widen
+from dyngrasp.lanes import LANES, lanes_of, load, narrow, store, sum_of
 from dyngrasp.planning.replanning.box_rows import UNBOUNDED, collect
 from dyngrasp.planning.replanning.interior_point import INFEASIBLE, NONFINITE, OPTIMAL, interior_point
 from dyngrasp.planning.replanning.joint_splines import (
     POSITION,
     RATE,
     TAPS,
+    Filters,
     Indices,
-    Motion,
     boundary,
     factorise,
     filtered,
@@ -30,8 +30,13 @@ from dyngrasp.planning.replanning.joint_splines import (
 )
 from dyngrasp.signals import Array
 
+Weights = tuple[float, float, float, float]  # Q_q, Q_q̇, Q_v, Q_ΔT
+
 # A row may be violated by this much of its half-width: a tenth of what the audit forgives as rounding.
 VIOLATION = 1e-9
+
+# Iterations of each run of the interior point method.
+MAX_ITERATIONS = 60
 
 # Rows this close to their bound without any of them imposed are the first guess of which may become active.
 NEAR = 0.02
@@ -51,68 +56,54 @@ def distinct(codes: Indices) -> int:
 
 @njit(cache=True, error_model="numpy")
 def solve(
-    reference: Motion,
+    wanted: Array,
     T_ref: float,
     ends: Array,
     held: tuple[bool, bool],
-    weights: tuple[float, float, float],
+    weights: Weights,
     node_weights: Array,
-    duration_weight: float,
-    ends_cost: bool,
     boxes: Array,
     paper_rows: bool,
     duration: tuple[float, float],
-    first: Indices,
-    taps: Array,
-    bands: Array,
-    max_iterations: int,
-    scaled_motion: Array,
-    motion: Array,
+    filters: Filters,
+    z: Array,
 ) -> tuple[int, float, int, Indices, Array]:
     """Minimise ½ Σ_k Σ_j Q_q δq² + Q_q̇ δq̇² + Q_v δv² + ½ Σ_k Q_ΔT δT² between two boundary states, within boxes.
 
     Args:
-        reference: q*, q̇*, v*, each (K, n).
+        wanted: (3, K, W) q*, q̇*, v* of n joints in whole lanes, zero behind them.
         T_ref: ΔT* (s).
         ends: (2, 3, n) position, velocity, acceleration at both ends.
         held: Whether the acceleration is given at the start and at the end.
-        weights: Q_q, Q_q̇, Q_v.
+        weights: Q_q, Q_q̇, Q_v, and Q_ΔT of one grid point.
         node_weights: (K,) added to Q_q at each grid point.
-        duration_weight: Q_ΔT of one grid point.
-        ends_cost: Whether the sums run over all grid points or over k = 1 … N−1.
-        boxes: (4, n) q_min, q_max, q̇_max, v_max, clipped to what `box_rows` takes for unbounded.
-        paper_rows: The boxes of eq. (13c), which are linear about the reference, instead of the exact ones.
+        boxes: (4, n) q_min, q_max, q̇_max, v_max; overwritten by what `box_rows` takes for unbounded.
+        paper_rows: The boxes of eq. (13c), which are linear about the reference, instead of the exact ones, and sums
+            over k = 1 … N−1 instead of all grid points.
         duration: Bounds of T (s); equal ones fix it.
-        first: Of `filters`.
-        taps: Of `filters`.
-        bands: Of `filters`.
-        max_iterations: Of the interior point method.
-        scaled_motion: (3, K, n), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
-        motion: (3, K, n), overwritten by q, q̇, q̈, at both ends to the last digit those given; left as it is with
-            `paper_rows`.
+        filters: Of `joint_splines.filters`.
+        z: (3, K, W), overwritten by q, w, a; with `paper_rows` their linear model about the reference.
 
     Returns:
         Outcome, T, iterations of the interior point method, codes of the rows that were imposed, and their multipliers
         with those of the two bounds of T.
     """
-    K, n = reference[0].shape
     # Joints lie side by side in rows of whole lanes, W ≥ n numbers; what follows the joints is zero.
-    width = whole_lanes(n)
-    wanted, z = np.empty((3, K, width)), np.empty((3, K, width))
-    for kind in range(3):
-        widen(reference[kind], wanted[kind])
+    _, K, width = wanted.shape
+    n = ends.shape[2]
+    first, taps, bands = filters
     boxes[:] = np.minimum(np.maximum(boxes, -UNBOUNDED), UNBOUNDED)
     size = K - 2
     free_T = duration[1] - duration[0] > 1e-12
     T = min(max(T_ref, duration[0]), duration[1])
-    k_first, k_last = (0, K) if ends_cost else (1, K - 1)
-    stiffness_T = duration_weight * (k_last - k_first)
+    k_first, k_last = (1, K - 1) if paper_rows else (0, K)
+    stiffness_T = weights[3] * (k_last - k_first)
 
     scaled = np.array([weights[0], weights[1] / T_ref**2, weights[2] / T_ref**4])
-    base = np.empty((size, 3))
-    for i in range(size):
-        for d in range(3):
-            base[i, d] = scaled[0] * bands[0, i, d] + scaled[1] * bands[1, i, d] + scaled[2] * bands[2, i, d]
+    base = np.zeros((size, 3))
+    for kind in range(3):
+        if scaled[kind] > 0.0:
+            subtract(-scaled[kind], bands[kind], base)
     some_node = False
     for k in range(k_first, k_last):
         if node_weights[k] > 0.0:
@@ -190,7 +181,8 @@ def solve(
     multipliers = np.empty(codes.size + 2)
     near, least = collect(z, T, T_lin, boxes, rates, NEAR, a_ends, codes)
     multipliers[:2] = 0.0
-    if least < -VIOLATION:
+    constrained = least < -VIOLATION
+    if constrained:
         count = near
         slope = np.empty_like(z)
         filtered(r_by_T, slope)
@@ -204,7 +196,7 @@ def solve(
             x[:], z[:], T = x_free, z_free, T_free
             outcome, T, steps, count = interior_point(
                 codes, count, a_ends, first, taps, base, column, corner, g_T, slope, x, T, T_lin, z, boxes, rates,
-                duration, free_T, unit, violation, max_iterations, multipliers,
+                duration, free_T, unit, violation, MAX_ITERATIONS, multipliers,
             )  # fmt: skip
             iterations += steps
             if outcome != OPTIMAL:
@@ -221,13 +213,10 @@ def solve(
                 count, _ = collect(z_free, T_free, T_lin, boxes, rates, np.inf, a_ends, codes)
         if outcome == OPTIMAL and least < -VIOLATION:
             outcome = INFEASIBLE
-    if not paper_rows:
+    if not paper_rows and (constrained or moving_ends):
         boundary(T, T_ref, ends, wanted, False, values, slopes)
         sequence(x, values, held, r)
         filtered(r, z)
-        _in_real_time(z, T, ends, held, motion)
-    for kind in range(3):
-        narrow(1.0, z[kind], scaled_motion[kind])
     if outcome == OPTIMAL and not (0.0 < T < np.inf and product(z, z) < np.inf):
         outcome = NONFINITE
     return outcome, T, iterations, codes[:count].copy(), multipliers[: count + 2].copy()
@@ -301,10 +290,44 @@ def _cost(
 
 
 @njit(cache=True, error_model="numpy")
-def _in_real_time(z: Array, T: float, ends: Array, held: tuple[bool, bool], motion: Array) -> None:
-    """Write q, q̇, q̈ (3, N+1, n) of q, w, a (3, N+1, W), and into their ends what was given there."""
+def write_motion(
+    z: Array,
+    wanted: Array,
+    T: float,
+    T_ref: float,
+    ends: Array,
+    held: tuple[bool, bool],
+    paper_rows: bool,
+    joint: int,
+    motion: Array,
+) -> None:
+    """Write q, q̇, q̈ of the joints from `joint` on into the last rows of a motion (3, ≥ K, ≤ n).
+
+    Both ends are to the last digit what was given there. With `paper_rows` it is the paper's update (15) of the
+    reference.
+
+    Args:
+        z: (3, K, W) q, w, a of `solve`.
+        wanted: Of `solve`.
+        T: ΔT (s).
+        T_ref: ΔT* (s).
+        ends: Of `solve`.
+        held: Of `solve`.
+        paper_rows: Of `solve`.
+        joint: The first one written.
+        motion: What is written to.
+    """
+    K, n = z.shape[1], motion.shape[2]
     for kind in range(3):
-        narrow(T**-kind, z[kind], motion[kind])
-        for end in range(2):
-            if kind < 2 or held[end]:
-                motion[kind, -end] = ends[end, kind]
+        rows = motion[kind, motion.shape[1] - K :]
+        if paper_rows:
+            factor, _ = _of_reference(kind, T, T_ref)
+            for k in range(K):
+                for j in range(n):
+                    target = wanted[kind, k, joint + j]
+                    rows[k, j] = target + (z[kind, k, joint + j] - factor * target) / T_ref**kind
+        else:
+            narrow(T**-kind, z[kind], joint, rows)
+            for end in range(2):
+                if kind < 2 or held[end]:
+                    rows[-end] = ends[end, kind, joint : joint + n]

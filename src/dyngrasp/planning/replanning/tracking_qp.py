@@ -14,14 +14,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from dyngrasp.errors import InvalidProblem
+from dyngrasp.lanes import narrow, whole_lanes, widen
 from dyngrasp.planning.problem import MIN_INTERVALS, Status
-from dyngrasp.planning.replanning import tracking_kernel
 from dyngrasp.planning.replanning.interior_point import INFEASIBLE, ITERATION_LIMIT, NONFINITE, OPTIMAL
-from dyngrasp.planning.replanning.joint_splines import Indices, filters
+from dyngrasp.planning.replanning.joint_splines import Filters, Indices, Motion, filters
+from dyngrasp.planning.replanning.tracking_kernel import Weights, solve, write_motion
 from dyngrasp.signals import Array, frozen
 from dyngrasp.trajectory import Trajectory
 
@@ -50,6 +53,11 @@ class TrackingWeights:
         valid = self.position >= 0 and self.velocity >= 0 and self.acceleration > 0 and self.duration > 0
         if not (valid and np.isfinite([self.position, self.velocity, self.acceleration, self.duration]).all()):
             raise InvalidProblem(f"weights must be ≥ 0, those of acceleration and duration > 0; got {self}")
+
+    @cached_property
+    def numbers(self) -> Weights:
+        """What compiled code takes for them."""
+        return float(self.position), float(self.velocity), float(self.acceleration), float(self.duration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +110,8 @@ class TrackingSolution:
     Attributes:
         status: `converged`, or why not.
         duration: ΔT (s).
-        motion: (3, N+1, n) q (rad), q̇ (rad/s), q̈ (rad/s²); without meaning with `paper_rows`.
+        motion: (3, N+1, n) q (rad), q̇ (rad/s), q̈ (rad/s²), its boundary states those of the problem to the last digit;
+            with `paper_rows` the paper's update (15) of the reference.
         scaled: (3, N+1, n) q (rad), w = T q̇ and a = T² q̈ (rad); with `paper_rows` their linear model.
         iterations: Of the interior point method; 0 where no box is active.
         rows: Codes of the rows that were imposed, see `box_rows`.
@@ -119,14 +128,13 @@ class TrackingSolution:
     multipliers: Array
     elapsed_ms: float
 
-    def trajectory(self, problem: TrackingProblem) -> Trajectory:
-        """The motion in real time, its boundary states those of the problem to the last digit."""
-        if problem.paper_rows:
-            return paper_update(problem.reference, paper_step(problem, self))
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion."""
         return Trajectory.of(self.duration, self.motion)
 
 
-_STATUS = {
+STATUS = {
     OPTIMAL: Status.CONVERGED,
     INFEASIBLE: Status.INFEASIBLE,
     ITERATION_LIMIT: Status.ITERATION_LIMIT,
@@ -134,48 +142,64 @@ _STATUS = {
 }
 
 
-def solve_tracking(problem: TrackingProblem, max_iterations: int = 60) -> TrackingSolution:
-    """Solve the program; never raises for numerical reasons.
-
-    Args:
-        problem: What is asked.
-        max_iterations: Of each run of the interior point method.
-    """
+def solve_tracking(problem: TrackingProblem) -> TrackingSolution:
+    """Solve the program; never raises for numerical reasons."""
     began = time.perf_counter()
     reference = problem.reference
     N, n = reference.intervals, reference.position.shape[1]
     ends = np.empty((2, 3, n))
     ends[0], ends[1] = problem.start, problem.end
     held = (problem.hold_start_acceleration, problem.hold_end_acceleration)
-    w = problem.weights
     boxes = np.empty((4, n))
     boxes[0], boxes[1] = problem.position_lower, problem.position_upper
     boxes[2], boxes[3] = problem.velocity_limit, problem.acceleration_limit
-    first, taps, bands = filters(N, *held, not problem.paper_rows)
     scaled, motion = np.empty((3, N + 1, n)), np.empty((3, N + 1, n))
-    outcome, duration, iterations, rows, multipliers = tracking_kernel.solve(
+    outcome, duration, iterations, rows, multipliers = _solve(
         (reference.position, reference.velocity, reference.acceleration),
         reference.duration,
         ends,
         held,
-        (float(w.position), float(w.velocity), float(w.acceleration)),
+        problem.weights.numbers,
         np.zeros(N + 1) if problem.node_weights is None else problem.node_weights,
-        w.duration,
-        not problem.paper_rows,
         boxes,
         problem.paper_rows,
         (problem.min_duration, problem.max_duration),
-        first,
-        taps,
-        bands,
-        max_iterations,
+        filters(N, *held, not problem.paper_rows),
         scaled,
         motion,
     )
     elapsed = 1e3 * (time.perf_counter() - began)
     return TrackingSolution(
-        _STATUS[outcome], duration, frozen(motion), frozen(scaled), iterations, rows, multipliers, elapsed
+        STATUS[outcome], duration, frozen(motion), frozen(scaled), iterations, rows, multipliers, elapsed
     )
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(
+    reference: Motion,
+    T_ref: float,
+    ends: Array,
+    held: tuple[bool, bool],
+    weights: Weights,
+    node_weights: Array,
+    boxes: Array,
+    paper_rows: bool,
+    duration: tuple[float, float],
+    filters: Filters,
+    scaled: Array,
+    motion: Array,
+) -> tuple[int, float, int, Indices, Array]:
+    """`solve` and `write_motion` about q*, q̇*, v*, each (K, n); q, w, a go into `scaled` (3, K, n)."""
+    K, n = reference[0].shape
+    width = whole_lanes(n)
+    wanted, z = np.empty((3, K, width)), np.empty((3, K, width))
+    for kind in range(3):
+        widen(reference[kind], wanted[kind])
+    answer = solve(wanted, T_ref, ends, held, weights, node_weights, boxes, paper_rows, duration, filters, z)
+    for kind in range(3):
+        narrow(1.0, z[kind], 0, scaled[kind])
+    write_motion(z, wanted, answer[1], T_ref, ends, held, paper_rows, 0, motion)
+    return answer
 
 
 def paper_step(problem: TrackingProblem, solution: TrackingSolution) -> Array:
