@@ -72,6 +72,46 @@ def newton_matrix(
 
 
 @njit(cache=True, error_model="numpy")
+def bordered_step(
+    first: bool,
+    free_T: bool,
+    band: Array,
+    column: Array,
+    complement: float,
+    solved: Array,
+    step: Array,
+    step_T: float,
+) -> tuple[float, float]:
+    """Solve a Newton matrix, its band factorised, for a right-hand side: (N−1, W) in `step`, overwritten, and `step_T`.
+
+    Args:
+        first: Whether it is the first one of this matrix.
+        free_T: Whether T is a variable.
+        band: Its factors.
+        column: (N−1, W) by the unknowns and T.
+        complement: The last diagonal element; once the first is solved, what this returned then.
+        solved: (N−1, W) the column times the inverse of the band, written by the first.
+        step: The right-hand side.
+        step_T: That of T.
+
+    Returns:
+        The Schur complement of the band, and the step of T.
+    """
+    if not free_T:
+        substitute(band, step)
+        return complement, 0.0
+    if first:
+        write(1.0, column, solved)
+        substitute_both(band, solved, step)
+        complement -= product(column, solved)
+    else:
+        substitute(band, step)
+    step_T = (step_T - product(column, step)) / complement
+    subtract(step_T, solved, step)
+    return complement, step_T
+
+
+@njit(cache=True, error_model="numpy")
 def finish(
     rounds: int,
     penalty: float,
@@ -139,17 +179,7 @@ def finish(
                 step_T += y * cs[i]
                 for b in range(TAPS):
                     flat_step[at[i] + b * width] += y * along[i, b]
-            if polish == 0 and free_T:
-                write(1.0, column, solved)
-                substitute_both(band, solved, step)
-                complement -= product(column, solved)
-            else:
-                substitute(band, step)
-            if free_T:
-                step_T = (step_T - product(column, step)) / complement
-                subtract(step_T, solved, step)
-            else:
-                step_T = 0.0
+            complement, step_T = bordered_step(polish == 0, free_T, band, column, complement, solved, step, step_T)
             worst = 0.0
             for i in range(used):
                 value = g[i] + cs[i] * step_T

@@ -9,16 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from dyngrasp.planning.replanning.active_set import finish, newton_matrix
+from dyngrasp.planning.replanning.active_set import bordered_step, finish, newton_matrix
 from dyngrasp.planning.replanning.box_rows import collect, impose, scatter
 from dyngrasp.planning.replanning.joint_splines import (
     TAPS,
     Indices,
     factorise,
-    product,
     push_forward,
-    substitute,
-    substitute_both,
     subtract,
     write,
 )
@@ -217,17 +214,7 @@ def interior_point(
                 dlam[i] = second * per_s[i] - omega[i] * (g[i] - s[i]) - lam[i]
             write(-1.0, residual, step)
             step_T = -residual_T + scatter(dlam, 1.0, 0, used, width, at, along, cs, flat_step)
-            if corrected == 0 and free_T:
-                write(1.0, column, solved)
-                substitute_both(band, solved, step)
-                complement -= product(column, solved)
-            else:
-                substitute(band, step)
-            if free_T:
-                step_T = (step_T - product(column, step)) / complement
-                subtract(step_T, solved, step)
-            else:
-                step_T = 0.0
+            complement, step_T = bordered_step(corrected == 0, free_T, band, column, complement, solved, step, step_T)
             keep = 1.0 if corrected == 0 else 0.995
             shrink_primal, shrink_dual = keep, keep
             for i in range(used):
