@@ -9,11 +9,11 @@ import trimesh
 from dyngrasp.models.bounding_volumes import bounding_bodies, bounding_capsule, boxes_around
 from dyngrasp.models.distance_bounds import (
     GROUND,
+    Candidates,
     add_near_each_other,
     add_near_ground,
     add_near_pieces,
     add_pieces_near_ground,
-    first_of,
     lowest,
     space_for,
     tighten,
@@ -99,7 +99,8 @@ def moving(motions, middles, reaches, q=None, levers=None, lifted=None) -> Motio
 def added(add, *arguments):
     """What one of the functions adds to nothing, where there is room for all."""
     found = space_for(10000)
-    return first_of(found, add(*arguments, found, 0))
+    count = add(*arguments, found, 0)
+    return Candidates(found.which[:count], found.bounds[:count])
 
 
 def still(samples):

@@ -23,7 +23,8 @@ from dyngrasp.trajectory import PHASE_NAMES
 def sampled(task, plan, since=-np.inf):
     """Times, configurations (n + m, S) and the first samples of grasp and delivery."""
     assembly = assemble(task.robot, task.gripper)
-    return waypoints(*plan.arrays, since, (assembly.arm_indices, assembly.hand_indices))
+    arm, gripper, ends = plan.arrays
+    return waypoints(arm, gripper, ends, since, (assembly.arm_indices, assembly.hand_indices))
 
 
 def straightforward(task, targets, plan, since):
@@ -153,9 +154,9 @@ def test_more_candidates_than_there_was_room_for_at_first(task, targets, plan):
     motion, _ = motion_along(q, times, lifted, part_motion(targets), cell.kinematics)
     bodies, pieces = cell.bodies, cell.pieces
     found, groups = clearance._anywhere(
-        motion, closing, lifted, HORIZON, HORIZON, bodies, pieces, cell.link_pairs, cell.is_pad, cell.on_arm
+        tuple(motion), closing, lifted, HORIZON, HORIZON, cell.volumes, cell.link_pairs, cell.is_pad, cell.on_arm
     )
-    assert len(found.bounds) == groups[-1] > 8 * clearance._FEW
+    assert len(found[1]) == groups[-1] > 8 * clearance._FEW
     most = space_for(bodies.radii.size * (bodies.radii.size + 2 * len(pieces.low.T)) * times.size)
     windows = clearance._until_closing(bodies, cell.is_pad, closing, 0, times.size)
     count = add_near_pieces(motion, bodies, pieces, windows, HORIZON, most, 0)

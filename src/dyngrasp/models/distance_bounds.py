@@ -51,12 +51,6 @@ def space_for(count):
     return Candidates(np.empty((count, 3), np.int64), np.empty(count))
 
 
-@njit(cache=True)
-def first_of(found, count):
-    """The first so many of the `Candidates`."""
-    return Candidates(found.which[:count], found.bounds[:count])
-
-
 @njit(cache=True, inline="always")
 def _note(found, n, one, other, sample, bound):
     """Enter one candidate after n; number of them now."""
@@ -210,7 +204,7 @@ def add_near_each_other(motion, bodies, link_pairs, horizon, found, n):
         begin = 0
         while begin < samples:
             bound = _between_balls(p[j], p[k], begin) - bodies.reaches[j] - bodies.reaches[k]
-            if bound < 2 * horizon:
+            if bound < horizon:
                 apart = segment_distance(R[j], p[j], link_ends[j], R[k], p[k], link_ends[k], begin)
                 bound = apart - link_radii[j] - link_radii[k]
                 if bound < horizon:
@@ -263,14 +257,15 @@ def tighten(found, group, at, distance, one, other):
     Returns:
         Which of the group has the lowest bound now.
     """
-    i, j, sample = found.which[at]
+    which, bounds = found
+    i, j, sample = which[at]
     here = one[sample] + other[sample]
-    found.bounds[at] = np.inf
+    bounds[at] = np.inf
     for e in range(group[0], group[1]):
-        if e != at and found.which[e, 0] == i and found.which[e, 1] == j:
-            s = found.which[e, 2]
-            found.bounds[e] = max(found.bounds[e], distance - abs(one[s] + other[s] - here))
-    return lowest(found.bounds, group)
+        if e != at and which[e, 0] == i and which[e, 1] == j:
+            s = which[e, 2]
+            bounds[e] = max(bounds[e], distance - abs(one[s] + other[s] - here))
+    return lowest(bounds, group)
 
 
 @njit(cache=True)

@@ -53,10 +53,9 @@ def paths_in_world(R, p, reaches, paths):
     paths[0] = 0.0
     for k in range(1, p.shape[0]):
         shift[:], turn[:] = 0.0, 0.0
+        _add_squared_steps(p[k], shift)
         for a in range(3):
-            _add_squared_steps(p[k, a], shift)
-            for b in range(3):
-                _add_squared_steps(R[k, a, b], turn)
+            _add_squared_steps(R[k, a], turn)
         path = paths[k]
         for s in range(path.size):
             # 2 sin(θ/2) is the Frobenius norm of the change over √2.
@@ -66,10 +65,11 @@ def paths_in_world(R, p, reaches, paths):
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
-def _add_squared_steps(row, total):
-    """total[s] += (row[s] − row[s − 1])², from the second sample on."""
-    for s in range(1, row.size):
-        total[s] += (row[s] - row[s - 1]) ** 2
+def _add_squared_steps(rows, total):
+    """total[s] += |rows[:, s] − rows[:, s − 1]|², for three rows, from the second sample on."""
+    x, y, z = rows[0], rows[1], rows[2]
+    for s in range(1, total.size):
+        total[s] += (x[s] - x[s - 1]) ** 2 + (y[s] - y[s - 1]) ** 2 + (z[s] - z[s - 1]) ** 2
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -89,16 +89,19 @@ def paths_from_part(paths, q, hand, levers, lifted, seen):
         seen: (F, S) to write in (m).
     """
     links, samples = paths.shape
-    turned = np.zeros(samples)
+    part, turned = paths[-1], np.zeros(samples)
     for i in hand:
         for s in range(lifted + 1, samples):
             turned[s] += abs(q[i, s] - q[i, s - 1])
+    for s in range(lifted + 1, samples):
+        turned[s] += turned[s - 1]
     for k in range(links - 1):
-        for s in range(samples):
-            seen[k, s] = paths[k, s] + paths[-1, s]
-        if levers[k] >= 0.0:
-            for s in range(lifted + 1, samples):
-                seen[k, s] = seen[k, s - 1] + levers[k] * turned[s]
+        own, out = paths[k], seen[k]
+        together = samples if levers[k] < 0.0 else min(lifted + 1, samples)
+        for s in range(together):
+            out[s] = own[s] + part[s]
+        for s in range(together, samples):
+            out[s] = out[lifted] + levers[k] * turned[s]
     seen[-1] = 0.0
 
 

@@ -48,6 +48,7 @@ class CellGeometry:
         on_arm: (B,) bodies of the arm and its base.
         rows: Rows of the joints of arm and hand among all.
         kinematics: What `motion_along` takes.
+        volumes: Bodies and pieces as plain tuples, which compiled code is handed over in half the time.
         T_flange_part: How the part hangs.
     """
 
@@ -88,11 +89,11 @@ class CellGeometry:
         links, moving = np.array(self.links[:count]), assembly.pin_model.njoints
         bodies, middles = bounding_bodies(self.shapes[:count], self._on_links, links, moving)
         pieces, middle = boxes_around(self._points, count)
-        self.bodies, self.pieces = bodies, pieces
+        self.bodies, self.pieces, self.volumes = bodies, pieces, (tuple(bodies), tuple(pieces))
         middles = read_only([*middles, middle])
         placements = [*self._on_links, *(pin.SE3.Identity() for _ in self._points), pin.SE3.Identity()]
         self._placed = [
-            coal.Transform3s(T.rotation, T.translation - middles[link])
+            coal.Transform3s(T.rotation, T.translation if link == WORLD else T.translation - middles[link])
             for T, link in zip(placements, self.links, strict=True)
         ]
         # The hand counts as the last link; what is fewer joints apart touches by construction or cannot meet.
@@ -131,6 +132,8 @@ class CellGeometry:
 
     def _at(self, i: int, R: Array, p: Array, k: int) -> coal.Transform3s:
         link = self.links[i]
+        if link == WORLD:
+            return self._placed[i]
         return coal.Transform3s(R[link, :, :, k], p[link, :, k]) * self._placed[i]
 
 

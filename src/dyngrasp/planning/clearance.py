@@ -13,14 +13,14 @@ import itertools
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
+from dyngrasp.models.bounding_volumes import Bodies, Pieces
 from dyngrasp.models.distance_bounds import (
-    Candidates,
     add_near_each_other,
     add_near_ground,
     add_near_pieces,
     add_pieces_near_ground,
-    first_of,
     lowest,
     space_for,
     tighten,
@@ -73,14 +73,14 @@ def clearance_entries(
     cell = cell_geometry(task, targets.grasp.name)
     times, closing, lifted, motion, sunk, finite, found, taken, hanging = _at_the_grasp(
         *plan.arrays, since, part_motion(targets), task.grasp_object.underside, cell.rows, cell.kinematics,
-        cell.bodies, cell.pieces, cell.is_pad,
+        cell.volumes, cell.is_pad,
     )  # fmt: skip
     if finite:
         part = _nearest(cell, motion, found, (0, taken), _FROM_PART, (HORIZON, 0, ""))
         carried = _nearest(cell, motion, found, (taken, hanging), _IN_WORLD, (HORIZON, lifted, ""))
         found, groups = _anywhere(
-            motion, closing, lifted, part[0] - RESOLUTION, carried[0] - RESOLUTION, cell.bodies, cell.pieces,
-            cell.link_pairs, cell.is_pad, cell.on_arm,
+            motion, closing, lifted, part[0] - RESOLUTION, carried[0] - RESOLUTION, cell.volumes, cell.link_pairs,
+            cell.is_pad, cell.on_arm,
         )  # fmt: skip
         ground = itself = HORIZON, 0, ""
         if groups[-1] > 0:
@@ -107,14 +107,16 @@ def _entry(name: str, found: Nearest, bound: float, tolerance: float, times: Arr
 
 
 @njit(cache=True, error_model="numpy")
-def _at_the_grasp(arm, gripper, ends, since, part, underside, rows, kinematics, bodies, pieces, is_pad):
+def _at_the_grasp(arm, gripper, ends, since, part, underside, rows, kinematics, volumes, is_pad):
     """How all moves, and what is near when the part is taken and lifted.
 
     Returns:
         Times (S,); the samples from which on the pads may touch the part and from which on it hangs; `Motion`; how far
-        an estimate puts the standing part into the ground (m); whether all is finite; pairs within `HORIZON`, hand and
-        part at the last sample before it hangs, part and ground at the next one; how many of the first kind; of both.
+        an estimate puts the standing part into the ground (m); whether all is finite; `Candidates` within `HORIZON`,
+        hand and part at the last sample before it hangs, part and ground at the next one; how many of the first kind;
+        of both.
     """
+    bodies, pieces = Bodies(*volumes[0]), Pieces(*volumes[1])
     times, q, closing, lifted = waypoints(arm, gripper, ends, since, rows)
     motion, finite = motion_along(q, times, lifted, part, kinematics)
     most = pieces.low.shape[1] * (bodies.radii.size + 1)
@@ -123,16 +125,20 @@ def _at_the_grasp(arm, gripper, ends, since, part, underside, rows, kinematics, 
         windows = _until_closing(bodies, is_pad, closing, last, last + 1)
         taken = add_near_pieces(motion, bodies, pieces, windows, HORIZON, found, 0)
         hanging = add_pieces_near_ground(motion, pieces, (lifted, lifted + 1), HORIZON, found, taken)
-    return times, closing, lifted, motion, _sunk(part, underside), finite, first_of(found, hanging), taken, hanging
+    return (
+        times, closing, lifted, (motion.R, motion.p, motion.paths), _sunk(part, underside), finite,
+        (found.which[:hanging], found.bounds[:hanging]), taken, hanging,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
-def _anywhere(motion, closing, lifted, near_part, near_ground, bodies, pieces, link_pairs, is_pad, on_arm):
-    """Pairs that may come near at any sample, and where those of each kind begin and the last ones end.
+def _anywhere(motion, closing, lifted, near_part, near_ground, volumes, link_pairs, is_pad, on_arm):
+    """`Candidates` at all samples, and where those of each kind begin and the last ones end.
 
     First hand and part within `near_part` (m), then arm and hand with the ground and with themselves within `HORIZON`,
     then, within `near_ground` (m), the lifted part with the ground and with the arm.
     """
+    motion, bodies, pieces = Motion(*motion), Bodies(*volumes[0]), Pieces(*volumes[1])
     samples, room = motion.p.shape[2], _FEW
     on_the_way = _until_closing(bodies, is_pad, closing, 0, samples)
     by_arm = np.full((on_arm.size, 2), samples)
@@ -147,7 +153,7 @@ def _anywhere(motion, closing, lifted, near_part, near_ground, bodies, pieces, l
         hanging = add_pieces_near_ground(motion, pieces, (lifted, samples), near_ground, found, itself)
         arm = add_near_pieces(motion, bodies, pieces, by_arm, near_ground, found, hanging)
         if arm >= 0:
-            return first_of(found, arm), (0, part, ground, itself, hanging, arm)
+            return (found.which[:arm], found.bounds[:arm]), (0, part, ground, itself, hanging, arm)
         room *= 8
 
 
@@ -176,24 +182,30 @@ def _sunk(part, underside):
 
 
 def _nearest(
-    cell: CellGeometry, motion: Motion, found: Candidates, group: tuple[int, int], frame: int, best: Nearest
+    cell: CellGeometry,
+    motion: tuple[Array, Array, Array],
+    found: tuple[NDArray[np.int64], Array],
+    group: tuple[int, int],
+    frame: int,
+    best: Nearest,
 ) -> Nearest:
     """The nearest of a group of pairs, or `best` if none comes nearer than that.
 
     Args:
         cell: The bodies.
-        motion: Of their links.
-        found: Pairs; each that is measured raises the bounds of its neighbours.
+        motion: What makes up the `Motion` of their links.
+        found: What makes up `Candidates`; each that is measured raises the bounds of its neighbours.
         group: The first that counts, and one after the last.
         frame: Which of the paths bound how much their distances change.
         best: What is known already.
     """
     if group[0] == group[1]:
         return best
-    paths, at = motion.paths[frame], lowest(found.bounds, group)
-    while found.bounds[at] < best[0] - RESOLUTION:
-        i, j, k = found.which[at].tolist()
-        distance = cell.distance(i, j, motion.R, motion.p, k)
+    (R, p, paths), (which, bounds) = motion, found
+    paths, at = paths[frame], lowest(bounds, group)
+    while bounds[at] < best[0] - RESOLUTION:
+        i, j, k = which[at].tolist()
+        distance = cell.distance(i, j, R, p, k)
         if not distance >= best[0]:
             best = distance, k, f"{cell.names[i]} and {cell.names[j]}"
         at = tighten(found, group, at, distance, paths[cell.links[i]], paths[cell.links[j]])
