@@ -317,15 +317,18 @@ def write_motion(
         joint: The first one written.
         motion: What is written to.
     """
-    K, n = z.shape[1], motion.shape[2]
+    _, K, width = z.shape
+    n = motion.shape[2]
     for kind in range(3):
         rows = motion[kind, motion.shape[1] - K :]
         if paper_rows:
             factor, _ = _of_reference(kind, T, T_ref)
+            scale, reached, target, out = T_ref**-kind, z[kind].ravel(), wanted[kind].ravel(), rows.ravel()
             for k in range(K):
-                for j in range(n):
-                    target = wanted[kind, k, joint + j]
-                    rows[k, j] = target + (z[kind, k, joint + j] - factor * target) / T_ref**kind
+                for j in range(0, n, LANES):
+                    old = load(target, k * width + joint + j, n - j)
+                    step = scale * (load(reached, k * width + joint + j, n - j) - factor * old)
+                    store(old + step, out, k * n + j, n - j)
         else:
             narrow(T**-kind, z[kind], joint, rows)
             for end in range(2):
