@@ -7,9 +7,11 @@ import pinocchio as pin
 import pytest
 
 from dyngrasp.planning.audit import audit
+from dyngrasp.planning.audit_rows import CHORD_TOLERANCE
 from dyngrasp.planning.plan_samples import SUBSTEPS
+from dyngrasp.trajectory import Trajectory
 
-from .failing_cases import PLANS, every_other, unchecked, with_arm
+from .failing_cases import PLANS, arm_limited, every_other, unchecked, with_arm
 
 
 def busier_pad(wrench: pin.Force, task, grasp) -> float:
@@ -88,5 +90,58 @@ def test_what_is_broken_between_two_grid_points_only_is_found(plan, targets, tas
     assert abs(inside) > 1.1 * abs(grid), "no peak between the grid points"
     strict = replace(task, settings=replace(task.settings, **{key: abs(grid + inside) / 2}))
     entry = audit(coarse, targets, strict)[name]
+    assert not entry.ok
+    assert entry.worst == pytest.approx(inside, abs=1e-11)
+
+
+def ringing(plan, phase: int, joint: int, amount: float):
+    """The plan with an acceleration that jumps to and fro, of which grid points show no position and no velocity."""
+    whole = plan.arm[phase]
+    v = whole.acceleration.copy()
+    v[::2, joint] += amount
+    v[1::2, joint] -= amount
+    rung = Trajectory(whole.duration, whole.position, whole.velocity, v)
+    return with_arm(plan, *(rung if i == phase else other for i, other in enumerate(plan.arm)))
+
+
+def test_a_velocity_that_rings_between_grid_points_is_found(plan, targets, task):
+    """The trapezoidal rule allows it: neighbouring accelerations cancel."""
+    joint, arm, limits = 3, plan.arm[0], task.robot.limits
+    step, fastest = arm.duration / arm.intervals, np.abs(arm.velocity[:, joint]).max()
+    velocity = limits.velocity.copy()
+    velocity[joint] = 1.001 * fastest
+    strict = arm_limited(task, None, velocity=velocity)
+    assert audit(plan, targets, strict)["velocity"].ok
+    # Half way the velocity departs by Δt/4 times the amplitude.
+    bad = ringing(plan, 0, joint, 4 * 0.02 * fastest / step)
+    entry = audit(bad, targets, strict)["velocity"]
+    assert not entry.ok
+    times = np.linspace(0.0, arm.duration, SUBSTEPS * arm.intervals + 1)
+    found = np.abs(bad.arm[0].sample_many(times)[1][:, joint]).max() / velocity[joint]
+    assert found > 1.015
+    assert entry.worst == pytest.approx(found, abs=1e-12)
+
+
+def test_a_position_that_rings_between_grid_points_is_found(plan, targets, task):
+    joint, limits = 3, task.robot.limits
+    coarse = with_arm(plan, *(every_other(phase, 20) for phase in plan.arm))
+    coarse = unchecked(coarse, gripper=tuple(every_other(phase, 20) for phase in plan.gripper))
+    grid = max(phase.position[:, joint].max() for phase in coarse.arm)
+    bad = ringing(coarse, 0, joint, 30.0)
+    times = np.linspace(0.0, bad.arm[0].duration, SUBSTEPS * bad.arm[0].intervals + 1)
+    found = bad.arm[0].sample_many(times)[0][:, joint].max()
+    assert found > grid + 0.05, "nothing rings"
+    upper = limits.position_upper.copy()
+    upper[joint] = (grid + found) / 2
+    strict = arm_limited(task, None, position_upper=upper)
+    assert not audit(bad, targets, strict)["position"].ok
+
+
+def test_a_hand_that_rings_between_grid_points_is_found(plan, targets, task):
+    bad = ringing(plan, 1, 0, 1000.0)
+    grid, inside = (one_sample_after_the_other(bad, targets, task, n)["grasp_axis"] for n in (1, SUBSTEPS))
+    assert inside > grid + 2 * CHORD_TOLERANCE, "nothing rings"
+    strict = replace(task, settings=replace(task.settings, lateral_tolerance=(grid + inside) / 2 - CHORD_TOLERANCE))
+    entry = audit(bad, targets, strict)["grasp_axis"]
     assert not entry.ok
     assert entry.worst == pytest.approx(inside, abs=1e-11)

@@ -65,6 +65,7 @@ class PlanModels(NamedTuple):
         carried: Mass (kg), first moment (3,) (kg m) and inertia (3, 3) (kg m²) that its last link has more with the
             part in the closed hand.
         hand: Where the hand is.
+        reach: How far G can be from any joint, at most (m).
         held: The part in it.
         funnel: σ_x, σ_y and z_th of eq. (5) (m).
         pregrasp: How far above the grasp frame the approach ends (m).
@@ -78,6 +79,7 @@ class PlanModels(NamedTuple):
     empty: tuple[Array, ...]
     carried: tuple[float, Array, Array]
     hand: Hand
+    reach: float
     held: Held
     funnel: tuple[float, float, float]
     pregrasp: float
@@ -111,6 +113,7 @@ def plan_models(task: GraspTask, grasp_name: str) -> PlanModels:
             read_only(loaded.inertia[-1] - empty.inertia[-1]),
         ),
         hand=Hand(assembly.arm_indices, assembly.hand_indices, tree.tree, frames.arrays),
+        reach=float(np.linalg.norm(tree.offsets, axis=1).sum() + np.linalg.norm(frames.positions, axis=1).max()),
         held=Held(
             float(body.mass),
             read_only(body.mass * body.lever),

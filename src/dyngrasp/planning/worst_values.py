@@ -19,8 +19,8 @@ from dyngrasp.planning.audit_rows import ARM, AXIS, DIP, FUNNEL, GRIPPER, HOLD, 
 from dyngrasp.planning.part_motion import part_poses
 from dyngrasp.trajectory import largest
 
-# A function of the motion departs from the chord between two grid points by about an eighth of its second difference
-# there. An interval in which four times that could break a constraint is suspect.
+# A smooth function departs from the chord between two grid points by about an eighth of its second difference there. An
+# interval in which four times that could break a constraint is suspect.
 CURVATURE_FACTOR = 4.0 / 8.0
 
 _pad_loads = njit(cache=True)(pad_loads)
@@ -65,17 +65,23 @@ def enter_worst_values(samples, part, wall, models, table):
     _enter_limits(arm, models.arm_boxes, times, table[ARM:], suspects)
     _enter_limits(gripper, models.gripper_boxes, times, table[GRIPPER:], suspects)
     if lifted:
-        hand = models.hand
+        hand, ringing = models.hand, np.zeros(lifted)
+        _add_ringing(arm[2], times[:lifted], ringing)
+        _add_ringing(gripper[2], times[:lifted], ringing)
         both = side_by_side(arm[0, :, :lifted], gripper[0, :, :lifted], hand.arm_indices, hand.hand_indices)
         R, p = frame_poses(both, hand.tree, hand.frames)
         G, angle = hand_in_grasp_frame(R, p, times[:lifted], part, models.grasp_on_part)
-        _enter_funnel(G[:, :closing], wall, models.funnel, times, table[FUNNEL], suspects)
-        _enter_closing(G, angle, closing, models.bounds, times, table, suspects)
+        aside = models.reach * ringing
+        _enter_funnel(G[:, :closing], wall, models.funnel, aside, times, table[FUNNEL], suspects)
+        _enter_closing(G, angle, closing, models.bounds, aside, ringing, times, table, suspects)
     carries = np.zeros(last)
     carries[lifted:] = 1.0
     torque, motion = newton_euler(arm[0], arm[1], arm[2], models.empty, models.carried, carries)
-    _enter_shares(torque, np.zeros(models.torque.size), models.torque, True, times, table[TORQUE], suspects)
-    _judge(_grip_shares(motion[:, lifted:], models.held), 1.0, 1.0, times[lifted:], table[HOLD], suspects[lifted:])
+    share = _shares(torque, np.zeros(models.torque.size), models.torque)
+    _enter_shares(share, times, table[TORQUE])
+    _mark_bends(share, suspects)
+    grip = _grip_shares(motion[:, lifted:], models.held)
+    _judge(grip, np.zeros(grip.size), 1.0, 1.0, times[lifted:], table[HOLD], suspects[lifted:])
     # What follows the last sample of a phase is a join: no time passes there.
     for stop in (closing, lifted, last):
         if stop > 0:
@@ -85,32 +91,95 @@ def enter_worst_values(samples, part, wall, models, table):
 
 @njit(cache=True, error_model="numpy")
 def _enter_limits(states, boxes, times, rows, suspects):
-    """Positions, velocities and accelerations (3, n, M) within boxes, as parts of their half-widths."""
+    """Positions, velocities and accelerations (3, n, M) within boxes, as parts of their half-widths.
+
+    Between two samples the acceleration is linear. So a velocity departs from its chord by Δt/8 times the change of the
+    acceleration, a position by Δt²/8 times the larger one of the two, at most.
+    """
     middles, limits = boxes
     for kind in range(3):
-        # Between two grid points accelerations are linear: no worse than there.
-        _enter_shares(states[kind], middles[kind], limits[kind], kind < 2, times, rows[kind], suspects)
+        share = _shares(states[kind], middles[kind], limits[kind])
+        _enter_shares(share, times, rows[kind])
+        if kind < 2:
+            _mark_departures(share, states[2], limits[kind], kind, times, suspects)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _enter_shares(values, middles, limits, bends, times, row, suspects):
-    """Values (n, M) less their middles (n,) as parts of their limits (n,); whether they bend between the samples."""
-    share = np.empty(values.shape[1])
+def _mark_departures(share, acceleration, limits, kind, times, suspects):
+    """Mark the intervals in which positions (kind 0) or velocities (1) could pass limits, of which they are shares."""
+    last = max(share.shape[1] - 1, 0)
+    reached = np.zeros(max(last, 1))
+    for i in range(limits.size):
+        inverse = 1.0 / (8.0 * limits[i])
+        for k in range(last):
+            step, x, y = times[k + 1] - times[k], share[i, k], share[i, k + 1]
+            v, v_next = acceleration[i, k], acceleration[i, k + 1]
+            # (|a + b| + |a − b|) / 2 is the larger of |a| and |b|.
+            departs = step * abs(v_next - v)
+            if kind == 0:
+                departs = step * step * (abs(v_next + v) + abs(v_next - v)) / 2.0
+            reached[k] = (x + y + abs(x - y)) / 2.0 + inverse * departs
+        if not largest(reached) <= 1.0:
+            for k in range(last):
+                if not reached[k] <= 1.0:
+                    suspects[k] = True
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _add_ringing(acceleration, times, ringing):
+    """Add how far (M,) (rad) joints may go from where a smooth motion would, between samples and the next ones.
+
+    Accelerations (n, M) that jump to and fro leave no trace in the positions at the samples. What jumps, their second
+    difference, moves a joint by Δt²/8 times that, at most.
+    """
+    bends = np.zeros(times.size)
+    for i in range(acceleration.shape[0]):
+        v = acceleration[i]
+        for k in range(1, times.size - 1):
+            bends[k] += abs(v[k - 1] - 2.0 * v[k] + v[k + 1])
+    for k in range(1, times.size - 1):
+        # Where a phase ends accelerations may jump.
+        if times[k] == times[k - 1] or times[k + 1] == times[k]:
+            bends[k] = 0.0
+    for k in range(times.size - 1):
+        step = times[k + 1] - times[k]
+        ringing[k] += step * step / 8.0 * max(bends[k], bends[k + 1])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _shares(values, middles, limits):
+    """Values (n, M) less their middles (n,) as parts of their limits (n,)."""
+    share = np.empty(values.shape)
     for i in range(limits.size):
         middle, inverse = middles[i], 1.0 / limits[i]
-        for k in range(share.size):
-            share[k] = abs(values[i, k] - middle) * inverse
-        most = largest(share)
-        if row[2] < 0.0 or not most <= row[0]:
-            enter(row, 1.0, most, times[_first_at(share, most)], i)
-        # Between zero and the largest no second difference exceeds twice that. Most rows are far from their bounds
-        # everywhere; a NaN is not.
-        if bends and not 1.0 - most >= CURVATURE_FACTOR * 2.0 * most:
-            _mark_suspects(share, 1.0, 1.0, suspects)
+        for k in range(values.shape[1]):
+            share[i, k] = abs(values[i, k] - middle) * inverse
+    return share
 
 
 @njit(cache=True, error_model="numpy")
-def _enter_funnel(G, wall, funnel, times, row, suspects):
+def _enter_shares(share, times, row):
+    """Enter the largest of shares (n, M) ≥ 0."""
+    if share.shape[1] > 0:
+        for i in range(share.shape[0]):
+            most = largest(share[i])
+            if row[2] < 0.0 or not most <= row[0]:
+                enter(row, 1.0, most, times[_first_at(share[i], most)], i)
+
+
+@njit(cache=True, error_model="numpy")
+def _mark_bends(share, suspects):
+    """Mark the intervals in which shares (n, M) could exceed one."""
+    nothing = np.zeros(share.shape[1])
+    for i in range(share.shape[0]):
+        # Between zero and the largest no second difference exceeds twice that: most are far from one everywhere.
+        most = largest(share[i]) if nothing.size > 0 else 0.0
+        if not 1.0 - most >= CURVATURE_FACTOR * 2.0 * most:
+            _mark_suspects(share[i], nothing, 1.0, 1.0, suspects)
+
+
+@njit(cache=True, error_model="numpy")
+def _enter_funnel(G, wall, funnel, ringing, times, row, suspects):
     """Height h(q) of G (3, M), eq. (6), above the inverted Gaussian of eq. (5) times what there is of the wall."""
     (sigma_x, sigma_y, threshold), height = funnel, np.empty(G.shape[1])
     for s in range(height.size):
@@ -118,19 +187,19 @@ def _enter_funnel(G, wall, funnel, times, row, suspects):
         risen = wall.factor + (1.0 - wall.factor) * min(max(share, 0.0), 1.0)
         bell = np.exp(-0.5 * ((G[0, s] / sigma_x) ** 2 + (G[1, s] / sigma_y) ** 2))
         height[s] = G[2, s] - risen * threshold * (1.0 - bell)
-    _judge(height, 0.0, -1.0, times, row, suspects)
+    _judge(height, ringing, 0.0, -1.0, times, row, suspects)
 
 
 @njit(cache=True, error_model="numpy")
-def _enter_closing(G, angle, closing, bounds, times, table, suspects):
+def _enter_closing(G, angle, closing, bounds, aside_between, ringing, times, table, suspects):
     """While the hand closes G stays on the grasp axis and not far below the frame, and the hand does not turn."""
     aside = np.empty(angle.size - closing)
     for s in range(aside.size):
         aside[s] = np.sqrt(G[0, closing + s] ** 2 + G[1, closing + s] ** 2)
-    times, suspects = times[closing:], suspects[closing:]
-    _judge(aside, bounds[AXIS], 1.0, times, table[AXIS], suspects)
-    _judge(G[2, closing:], bounds[DIP], -1.0, times, table[DIP], suspects)
-    _judge(angle[closing:], bounds[TILT], 1.0, times, table[TILT], suspects)
+    times, suspects, between = times[closing:], suspects[closing:], aside_between[closing:]
+    _judge(aside, between, bounds[AXIS], 1.0, times, table[AXIS], suspects)
+    _judge(G[2, closing:], between, bounds[DIP], -1.0, times, table[DIP], suspects)
+    _judge(angle[closing:], ringing[closing:], bounds[TILT], 1.0, times, table[TILT], suspects)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -207,10 +276,11 @@ def _grip_shares(motion, held):
 
 
 @njit(cache=True, error_model="numpy")
-def _judge(values, bound, sign, times, row, suspects):
+def _judge(values, unseen, bound, sign, times, row, suspects):
     """Enter the worst of values (M,), and mark where a bound could be broken between two of them.
 
-    For `sign` 1 they must not exceed the bound, for −1 not fall below it. Nothing is entered where there are none.
+    For `sign` 1 they must not exceed the bound, for −1 not fall below it. By `unseen` (M,) they may change between two
+    samples without a trace in them. Nothing is entered where there are none.
     """
     if values.size > 0:
         worst = 0
@@ -218,7 +288,7 @@ def _judge(values, bound, sign, times, row, suspects):
             if not sign * values[s] <= sign * values[worst] and values[worst] == values[worst]:
                 worst = s
         enter(row, sign, values[worst], times[worst], 0)
-        _mark_suspects(values, bound, sign, suspects)
+        _mark_suspects(values, unseen, bound, sign, suspects)
 
 
 @njit(cache=True)
@@ -231,12 +301,12 @@ def _first_at(values, wanted):
 
 
 @njit(cache=True, error_model="numpy")
-def _mark_suspects(row, bound, sign, suspects):
-    """Mark the intervals between samples of a row (m,) in which the bound is not farther than it may bend."""
+def _mark_suspects(row, unseen, bound, sign, suspects):
+    """Mark the intervals between samples of a row (M,) in which the bound is not farther than it may bend."""
     last, before = row.size - 1, 0.0
     for k in range(last):
         after = abs(row[k] - 2.0 * row[k + 1] + row[k + 2]) if k + 2 <= last else 0.0
-        slack = min(sign * (bound - row[k]), sign * (bound - row[k + 1]))
+        slack = min(sign * (bound - row[k]), sign * (bound - row[k + 1])) - unseen[k]
         # A NaN is suspect as well.
         if not slack >= CURVATURE_FACTOR * max(before, after):
             suspects[k] = True
