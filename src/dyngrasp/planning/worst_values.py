@@ -71,9 +71,8 @@ def enter_worst_values(samples, part, wall, models, table):
         both = side_by_side(arm[0, :, :lifted], gripper[0, :, :lifted], hand.arm_indices, hand.hand_indices)
         R, p = frame_poses(both, hand.tree, hand.frames)
         G, angle = hand_in_grasp_frame(R, p, times[:lifted], part, models.grasp_on_part)
-        aside = models.reach * ringing
-        _enter_funnel(G[:, :closing], wall, models.funnel, aside, times, table[FUNNEL], suspects)
-        _enter_closing(G, angle, closing, models.bounds, aside, ringing, times, table, suspects)
+        _enter_funnel(G[:, :closing], wall, models, ringing, times, table[FUNNEL], suspects)
+        _enter_closing(G, angle, closing, models, ringing, times, table, suspects)
     carries = np.zeros(last)
     carries[lifted:] = 1.0
     torque, motion = newton_euler(arm[0], arm[1], arm[2], models.empty, models.carried, carries)
@@ -179,27 +178,30 @@ def _mark_bends(share, suspects):
 
 
 @njit(cache=True, error_model="numpy")
-def _enter_funnel(G, wall, funnel, ringing, times, row, suspects):
+def _enter_funnel(G, wall, models, ringing, times, row, suspects):
     """Height h(q) of G (3, M), eq. (6), above the inverted Gaussian of eq. (5) times what there is of the wall."""
-    (sigma_x, sigma_y, threshold), height = funnel, np.empty(G.shape[1])
+    (sigma_x, sigma_y, threshold), height = models.funnel, np.empty(G.shape[1])
     for s in range(height.size):
         share = ((times[s] - wall.begin) / wall.duration - wall.low) / (wall.high - wall.low)
         risen = wall.factor + (1.0 - wall.factor) * min(max(share, 0.0), 1.0)
         bell = np.exp(-0.5 * ((G[0, s] / sigma_x) ** 2 + (G[1, s] / sigma_y) ** 2))
         height[s] = G[2, s] - risen * threshold * (1.0 - bell)
-    _judge(height, ringing, 0.0, -1.0, times, row, suspects)
+    # The wall is steepest where the Gaussian turns: z_th / σ times e^(−1/2).
+    steepest = threshold / min(sigma_x, sigma_y) * np.exp(-0.5)
+    _judge(height, (1.0 + steepest) * models.reach * ringing, 0.0, -1.0, times, row, suspects)
 
 
 @njit(cache=True, error_model="numpy")
-def _enter_closing(G, angle, closing, bounds, aside_between, ringing, times, table, suspects):
+def _enter_closing(G, angle, closing, models, ringing, times, table, suspects):
     """While the hand closes G stays on the grasp axis and not far below the frame, and the hand does not turn."""
     aside = np.empty(angle.size - closing)
     for s in range(aside.size):
         aside[s] = np.sqrt(G[0, closing + s] ** 2 + G[1, closing + s] ** 2)
-    times, suspects, between = times[closing:], suspects[closing:], aside_between[closing:]
+    times, suspects, bounds, ringing = times[closing:], suspects[closing:], models.bounds, ringing[closing:]
+    between = models.reach * ringing
     _judge(aside, between, bounds[AXIS], 1.0, times, table[AXIS], suspects)
     _judge(G[2, closing:], between, bounds[DIP], -1.0, times, table[DIP], suspects)
-    _judge(angle[closing:], ringing[closing:], bounds[TILT], 1.0, times, table[TILT], suspects)
+    _judge(angle[closing:], ringing, bounds[TILT], 1.0, times, table[TILT], suspects)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
