@@ -77,7 +77,7 @@ def test_worst_values_are_those_of_one_sample_after_the_other(plan, targets, tas
         # Rounding of kinematics and dynamics; the funnel's wall climbs up to 30 m per metre.
         nearest = min(value, finer[name], key=lambda x, of=report[name].worst: abs(x - of))
         assert report[name].worst == pytest.approx(nearest, abs=1e-11), name
-    # At its end the acceleration jumps to what the next phase begins with, and the wall is steep.
+    # The last acceleration of the approach is free and off the line of those before, and the wall is steep there.
     assert report["funnel"].worst == pytest.approx(finer["funnel"], abs=1e-11)
     assert finer["funnel"] < at_grid_points["funnel"] - 1e-4
 
