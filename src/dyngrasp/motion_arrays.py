@@ -71,6 +71,20 @@ def write_state(trajectory, local, at_rest, state):
         state[1:] = 0.0
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def interval_at(t, duration, N):
+    """Which of N intervals a time (s) falls into, clamped to the duration, and what share of it has passed then."""
+    scaled = min(max(t, 0.0), duration) / (duration / N)
+    k = max(min(int(scaled), N - 1), 0)
+    return k, scaled - k
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def position_weights(step, s):
+    """What q̇, q̈ and the change of q̈ over an interval of `step` (s) add to the position when a share s has passed."""
+    return step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12)
+
+
 @njit(cache=True, error_model="numpy")
 def interpolate(trajectory, times, out):
     """`Trajectory.sample_many` (3, M, n); compiled, for controllers and audits ask for little and often."""
@@ -78,16 +92,14 @@ def interpolate(trajectory, times, out):
     N, n = position.shape[0] - 1, position.shape[1]
     step = duration / N
     for m in range(times.size):
-        scaled = min(max(times[m], 0.0), duration) / step
-        k = max(min(int(scaled), N - 1), 0)
-        s = scaled - k
+        k, s = interval_at(times[m], duration, N)
         if s == 0.0 or s == 1.0:
             # Most of what is asked for are grid points.
             for i in range(n):
                 at = k + int(s)
                 out[0, m, i], out[1, m, i], out[2, m, i] = position[at, i], velocity[at, i], acceleration[at, i]
             continue
-        by_rate, half, sixth, gain = step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12), step * s**2 / 2
+        (by_rate, half, sixth), gain = position_weights(step, s), step * s**2 / 2
         for i in range(n):
             v_k = acceleration[k, i]
             dv = acceleration[k + 1, i] - v_k

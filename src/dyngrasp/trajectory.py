@@ -21,7 +21,6 @@ from dyngrasp.motion_arrays import (
     Phases,
     all_finite,
     interpolate,
-    largest,
     largest_defect,
     largest_difference,
     largest_jump,
@@ -29,21 +28,6 @@ from dyngrasp.motion_arrays import (
     write_state,
 )
 from dyngrasp.signals import Array, JointState, frozen, made, read_only
-
-__all__ = [
-    "JOIN_TOLERANCE",
-    "PHASE_NAMES",
-    "GraspPlan",
-    "PhaseArrays",
-    "Phases",
-    "PlanSample",
-    "Trajectory",
-    "interpolate",
-    "largest",
-    "largest_defect",
-    "largest_difference",
-    "write_state",
-]
 
 PHASE_NAMES = ("approach", "grasp", "deliver")
 

@@ -97,7 +97,8 @@ def test_a_body_on_the_last_link_counts_at_the_samples_that_have_it(robot, paylo
     more = [getattr(loaded, name)[-1] - getattr(bare, name)[-1] for name in ("mass", "first_moment", "inertia")]
     # Full from a sample on that is none of the first of eight, and half of it at the last one.
     share = np.concatenate([np.zeros(21), np.ones(M - 22), [0.5]])
-    torque, _ = newton_euler(*motion, bare.chain, (float(more[0]), more[1], more[2]), share)
+    q, w, v = motion
+    torque, _ = newton_euler(q, w, v, bare.chain, (float(more[0]), more[1], more[2]), share)
     without, whole = bare.inverse_dynamics(*motion)[0], loaded.inverse_dynamics(*motion)[0]
     expected = without + share * (whole - without)
     np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-12 * np.abs(whole).max())

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.models.srs_chain import ALIGNED, BRANCHES, ROUNDING, angles_at, arm_angle_of, circle_at, put_on_branch
-from dyngrasp.trajectory import largest_difference
+from dyngrasp.motion_arrays import largest_difference
 
 _REFINED = 4  # local minima on the grid of arm angles that are looked into
 _FOUND = 1e-9  # how near to a minimum its search ends (rad)

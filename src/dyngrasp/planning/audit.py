@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.models.batch_dynamics import frame_poses, link_poses, side_by_side
+from dyngrasp.motion_arrays import largest_defect, largest_difference
 from dyngrasp.planning.audit_rows import DYNAMICS, JOIN, LIFT, PREGRASP, REST, ROWS, empty_table, enter
 from dyngrasp.planning.clearance import clearance_entries
 from dyngrasp.planning.grasp_targets import GraspTargets
@@ -21,7 +22,7 @@ from dyngrasp.planning.plan_models import plan_models
 from dyngrasp.planning.plan_samples import at_grid_points, between
 from dyngrasp.planning.problem import AuditEntry, AuditReport
 from dyngrasp.planning.worst_values import WHOLE, Wall, enter_worst_values, hand_in_grasp_frame, write_angles
-from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, largest_defect, largest_difference
+from dyngrasp.trajectory import PHASE_NAMES, GraspPlan
 
 # An arm slower than this, in parts of its joints' speed limits, has come to a standstill: half as much again as what is
 # called one when an episode is judged, for tracking is not exact. At both ends of a plan this part of it may be slower.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from dyngrasp.trajectory import JOIN_TOLERANCE
+from dyngrasp.motion_arrays import JOIN_TOLERANCE
 
 # Rounding of a ratio to a limit after a solver that stops at 1e-8 in its own scaling.
 RATIO_TOLERANCE = 1e-6

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from dyngrasp.motion_arrays import interpolate, interval_at, position_weights
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import interpolate
 
 # Samples of an interval between two grid points in which a constraint could be broken: a velocity, quadratic in
 # between, is then seen to 1/256 of its height.
@@ -132,14 +132,12 @@ def _write_positions(trajectory, times, rows, out):
     N = position.shape[0] - 1
     step = duration / N
     for m in range(times.size):
-        scaled = min(max(times[m], 0.0), duration) / step
-        k = max(min(int(scaled), N - 1), 0)
-        s = scaled - k
+        k, s = interval_at(times[m], duration, N)
         if s == 0.0 or s == 1.0:
             for i in range(rows.size):
                 out[rows[i], m] = position[k + int(s), i]
             continue
-        by_rate, half, sixth = step * s, step**2 * s**2 / 2, step**2 * (s**3 / 6 + s / 12)
+        by_rate, half, sixth = position_weights(step, s)
         for i in range(rows.size):
             v_k = acceleration[k, i]
             straight = position[k, i] + by_rate * velocity[k, i]

@@ -15,9 +15,9 @@ from dyngrasp.models.batch_dynamics import (
     wrench_along,
 )
 from dyngrasp.models.pinch import pad_loads
+from dyngrasp.motion_arrays import largest
 from dyngrasp.planning.audit_rows import ARM, AXIS, DIP, FUNNEL, GRIPPER, HOLD, TILT, TORQUE, enter
 from dyngrasp.planning.part_motion import part_poses
-from dyngrasp.trajectory import largest
 
 # A smooth function departs from the chord between two grid points by about an eighth of its second difference there. An
 # interval in which four times that could break a constraint is suspect.

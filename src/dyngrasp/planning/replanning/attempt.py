@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from dyngrasp.errors import GraspRefused, OutOfReach
+from dyngrasp.motion_arrays import JOIN_TOLERANCE
 from dyngrasp.planning.audit import audit, standstill
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask, grasp_targets, moved
 from dyngrasp.planning.problem import AuditReport, PhaseProblem, Status
@@ -20,7 +21,7 @@ from dyngrasp.planning.replanning.splice import Candidate, splice_time, track
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.planning.worst_values import WHOLE
 from dyngrasp.signals import PoseEstimate
-from dyngrasp.trajectory import JOIN_TOLERANCE, PHASE_NAMES, GraspPlan, PlanSample
+from dyngrasp.trajectory import PHASE_NAMES, GraspPlan, PlanSample
 
 
 class Attempt:

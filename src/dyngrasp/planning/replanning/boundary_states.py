@@ -13,8 +13,8 @@ from dyngrasp.models.flange_chain import least_rates
 from dyngrasp.models.inverse_kinematics import TWIST_TOLERANCE, write_null_space_velocity
 from dyngrasp.models.srs_chain import write_null_space_rate
 from dyngrasp.models.srs_search import follow_configuration
+from dyngrasp.motion_arrays import largest_difference
 from dyngrasp.planning.part_motion import part_poses
-from dyngrasp.trajectory import largest_difference
 
 
 @njit(cache=True, error_model="numpy")

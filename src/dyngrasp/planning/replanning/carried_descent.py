@@ -19,11 +19,11 @@ from numba import njit
 from dyngrasp.errors import OutOfReach
 from dyngrasp.lanes import LANES, lanes_of, load, store
 from dyngrasp.models.flange_chain import place_frames
+from dyngrasp.motion_arrays import PhaseArrays, write_state
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.part_motion import PartMotion, part_motion, part_poses
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.signals import Array, read_only
-from dyngrasp.trajectory import PhaseArrays, write_state
 
 KNOTS = 4
 

@@ -21,13 +21,14 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.models.flange_chain import place_frames
+from dyngrasp.motion_arrays import interpolate
 from dyngrasp.planning.grasp_targets import GraspTargets, GraspTask
 from dyngrasp.planning.part_motion import part_poses
 from dyngrasp.planning.problem import NodeConstraint
 from dyngrasp.planning.replanning.target_update import target_updater
 from dyngrasp.planning.worst_values import Wall
 from dyngrasp.signals import Array
-from dyngrasp.trajectory import GraspPlan, interpolate
+from dyngrasp.trajectory import GraspPlan
 
 # Of the constraint's parameters: three of G, nine of the grasp frame's axes by rows, three of its origin, then z_th.
 _AXES, _ORIGIN, _HEIGHT_PARAMETER = slice(3, 12), slice(12, 15), 15

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from dyngrasp.lanes import whole_lanes, widen
+from dyngrasp.motion_arrays import PhaseArrays, Phases, interpolate
 from dyngrasp.planning.grasp_targets import BoundaryState, GraspTask
 from dyngrasp.planning.problem import Status
 from dyngrasp.planning.replanning.carried_descent import Descent, DescentSettings, bend
@@ -17,7 +18,7 @@ from dyngrasp.planning.replanning.joint_splines import Filters
 from dyngrasp.planning.replanning.tracking_kernel import Weights, solve, write_motion
 from dyngrasp.planning.replanning.tracking_qp import TrackingProblem, TrackingWeights, solve_tracking
 from dyngrasp.signals import Array, JointState, read_only
-from dyngrasp.trajectory import PhaseArrays, Phases, Trajectory, interpolate
+from dyngrasp.trajectory import Trajectory
 
 APPROACH, GRASP, DELIVER = range(3)
 

@@ -11,10 +11,10 @@ from dyngrasp.errors import InvalidProblem, OutOfReach
 from dyngrasp.models.grasp_object import Grasp
 from dyngrasp.models.inverse_kinematics import inverse_kinematics_for, joint_velocity
 from dyngrasp.models.srs_kinematics import SrsKinematics
+from dyngrasp.motion_arrays import largest_difference
 from dyngrasp.planning.grasp_targets import BoundaryState, GraspTargets, GraspTask, swivel_velocity
 from dyngrasp.planning.replanning.boundary_states import flange_goals, srs_boundary_states
 from dyngrasp.signals import Array, frozen, read_only
-from dyngrasp.trajectory import largest_difference
 
 # Where the arm angle of the running plan is forbidden at the new pose, others are tried, nearest first (rad).
 _ARM_ANGLE_STEPS = np.deg2rad(np.arange(2.0, 61.0, 2.0))
