@@ -124,10 +124,6 @@ class TargetUpdater:
             self._flanges[key] = poses, np.array(hand.rotation[:, 2])
         return self._flanges[key]
 
-    def posture(self, T_world_flange: pin.SE3, q_previous: Array) -> Array:
-        """`postures` of one pose."""
-        return self.postures(T_world_flange.homogeneous[None, :3], q_previous[None])[0]
-
     def postures(self, poses: Array, like: Array) -> Array:
         """Configurations of the branches, and if the limits allow of the arm angles, of previous ones.
 
