@@ -31,6 +31,7 @@ from dyngrasp.planning.collocation.structured import StructuredSolver
 from dyngrasp.planning.grasp_targets import GraspTargets, grasp_targets, moved
 from dyngrasp.planning.replanning.funnel_recovery import FunnelRecovery
 from dyngrasp.planning.replanning.replanner import Replanner, ReplanResult
+from dyngrasp.planning.worst_values import WHOLE
 from dyngrasp.signals import PoseEstimate
 from dyngrasp.trajectory import GraspPlan
 
@@ -84,7 +85,7 @@ def offences(running: GraspPlan, result: ReplanResult, estimate: PoseEstimate, r
         found.append(f"jump of {jump:.1e}")
     softened = FunnelRecovery(result.recovery, replanner.settings.recovery_shares).wall(result.plan)
     # Of a plan that is past its pre-grasp the wall is whole.
-    wall = softened if result.plan.start_time == result.splice else np.ones_like
+    wall = softened if result.plan.start_time == result.splice else WHOLE
     report = audit(result.plan, result.targets, replanner.task, result.splice, wall)
     found += [f"{entry.name}" for entry in report.failures]
     if result.audit is None or not result.audit.ok:
