@@ -7,13 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from dyngrasp.models.batch_dynamics import (
-    compose,
-    frame_poses,
-    newton_euler,
-    side_by_side,
-    wrench_along,
-)
+from dyngrasp.models.batch_dynamics import compose, frame_poses, side_by_side
+from dyngrasp.models.newton_euler import newton_euler, wrench_along
 from dyngrasp.models.pinch import pad_loads
 from dyngrasp.motion_arrays import largest
 from dyngrasp.planning.audit_rows import ARM, AXIS, DIP, FUNNEL, GRIPPER, HOLD, TILT, TORQUE, enter
